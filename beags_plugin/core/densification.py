@@ -23,7 +23,6 @@ INITIAL_OPACITY = 0.1
 # Ours, for runs that are shorter than the official ones: ``DensifyConfig.scaled`` makes no interval shorter than these.
 LEAST_EVERY = 50  # an interval must show the surfels to many views
 LEAST_RESET_EVERY = 1_000  # opacities need time to recover
-UNPRUNED = 0.05  # the share of the base, at its end, without pruning by views: what is left must fill the place
 SH_C0 = 0.28209479177387814  # value of the constant basis function
 COINCIDENT = 1e-7  # smallest initial scale relative to the cloud's size: coincident points have no neighbour distance
 
@@ -50,12 +49,10 @@ class DensifyConfig:
     pixels_per_surfel: float = 0.0
     """Training pixels that each Gaussian needs at least, against overfitting of few images; 0, as officially, sets no
     bound."""
-    least_views: int = 0
-    """Gaussians that fewer training views than this show go, against overfitting: what one view alone shows may stand
-    anywhere on its rays. Those in the frames of more views than this stay, hidden: they fill things. 0 keeps all, as
-    does a scene of at most twice as many views."""
-    least_views_every: int = 3_000
-    """Steps between two such prunings, from ``start`` to the last twentieth of the base."""
+    free_share: float = 0.0
+    """Gaussians go that stand before a camera nearer than this share of the depth of the nearest seed points that it
+    shows: hardly another photo shows them, and held-out ones are covered by them. 0 keeps them, as does a scene whose
+    seed points were generated."""
 
     def scaled(self, factor: float) -> DensifyConfig:
         """Return the same for a run ``factor`` times as long: its steps are scaled, within the smallest intervals."""
@@ -70,7 +67,6 @@ class DensifyConfig:
             stop=steps(self.stop),
             prune_scale_after=steps(self.prune_scale_after, 1),
             reset_every=steps(self.reset_every, LEAST_RESET_EVERY),
-            least_views_every=max(steps(self.least_views_every, LEAST_EVERY), 1),
         )
 
     def bounded(self, pixels: int) -> DensifyConfig:
@@ -84,10 +80,9 @@ class DensifyConfig:
         """Return whether the scene is densified after ``done`` steps."""
         return self.start < done < self.stop and done % self.every == 0
 
-    def prunes_by_views_at(self, done: int, base_steps: int) -> bool:
-        """Return whether Gaussians that too few views show go after ``done`` steps of a base of ``base_steps``."""
-        wanted = self.least_views > 0 and self.start < done <= (1.0 - UNPRUNED) * base_steps
-        return wanted and done % self.least_views_every == 0
+    def frees_at(self, done: int, base_steps: int) -> bool:
+        """Return whether the space before cameras is freed after ``done`` steps of a base of ``base_steps``."""
+        return self.free_share > 0.0 and self.start < done < base_steps and done % self.every == 0
 
     def resets_at(self, done: int) -> bool:
         """Return whether opacities are reset after ``done`` steps."""

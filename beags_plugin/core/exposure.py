@@ -45,6 +45,14 @@ class Exposures:
         return apply_affine(photo, inverse).clamp(0.0, 1.0)
 
 
+def not_beyond_white(color: Tensor, photo: Tensor) -> Tensor:
+    """Return a rendering [H, W, 3], without gradient where the photo is burnt out and the rendering brighter still.
+
+    A photo cuts light off at 1, so it does not contradict a scene that is brighter there.
+    """
+    return torch.where((photo >= 1.0) & (color > photo), photo, color)
+
+
 @dataclass(frozen=True)
 class Sightings:
     """M observations of places by photos: place [M] int64, photo [M] int64, light [M, 3] float64, linear."""

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import initial_surfels
+from beags_plugin.core.exposure import not_beyond_white
 from beags_plugin.evaluation.run_metrics import psnr_after_fit
 from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.losses.base import LossInputs
@@ -127,12 +128,15 @@ class BeagsModel(SceneModel):
         image = self._truth(batch, outputs["background"])
         if not self.training or self.last_render is None:
             return {"photometric": (outputs["rgb"] - image).abs().mean()}
+        render = of_objects(self.last_render.render, image, batch)
+        if self.photo_colors is not None:
+            render = replace(render, color=not_beyond_white(render.color, image))
         inputs = LossInputs(
             step=self.step,
             seed=self.seed,
             surfels=self.surfels(),
             camera=self.last_render.camera,
-            render=of_objects(self.last_render.render, image, batch),
+            render=render,
             image=image,
             labels=self.last_render.labels,
             class_ids=self.class_ids,

@@ -205,10 +205,8 @@ def test_the_bound_by_pixels():
     assert replace(config, max_surfels=90).bounded(1000).max_surfels == 20
 
 
-def test_what_too_few_views_show_is_pruned_from_start_to_near_the_end_in_scaled_intervals():
-    config = replace(CONFIG, least_views=2)
-    steps = [done for done in range(1, 40_000) if config.prunes_by_views_at(done, 30_000)]
-    assert steps == list(range(3_000, 28_501, 3_000))
-    tenth = config.scaled(0.1)
-    assert [done for done in range(1, 4_000) if tenth.prunes_by_views_at(done, 3_000)] == list(range(300, 2_851, 300))
-    assert not any(CONFIG.prunes_by_views_at(done, 30_000) for done in steps)
+def test_the_space_before_cameras_is_freed_in_each_round_to_the_end_of_the_base():
+    config = replace(CONFIG, free_share=0.5)
+    steps = [done for done in range(1, 40_000) if config.frees_at(done, 30_000)]
+    assert steps == list(range(600, 30_000, 100))
+    assert not any(CONFIG.frees_at(done, 30_000) for done in steps)

@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.optim import Adam
 
+from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import Densified, GradientStatistics, densify, length_units, reset_opacity
+from beags_plugin.core.free_space import nearest_depths, reaches_before_camera
 from beags_plugin.plugin.training.scene_edits import edit_scene, move_adam_state
 from beags_plugin.plugin.training.scene_model import SceneModel
-from beags_plugin.plugin.training.showing_views import showing_views
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system import processes
 
@@ -27,6 +29,7 @@ class Densifier:
         self.config = model.config.densify.scaled(model.schedule.scale).bounded(pixels)
         self.adam = adam
         self.statistics = GradientStatistics(model.num_points, model.device)
+        self.free = self._free_depths()
 
     def state(self) -> dict[str, Any]:
         """Return the statistics since the scene last grew, as long as it grows; see ``resumable.Resumable``."""
@@ -45,15 +48,15 @@ class Densifier:
         self.model.growing = not schedule.warm and step + 1 < min(self.config.stop, schedule.base_steps)
 
     def after_step(self, step: int) -> None:
-        """Gather statistics; densify, prune by views and reset opacities when their step has come."""
+        """Gather statistics; densify, free the space before cameras and reset opacities when their step has come."""
         config, schedule, done = self.config, self.model.schedule, step + 1
         growing = self.model.growing and self.model.last_render is not None
         if growing:
             self._gather()
             if config.grows_at(done):
                 self._densify(done)
-        if not schedule.warm and config.prunes_by_views_at(done, schedule.base_steps):
-            self._prune_by_views(step)
+        if not schedule.warm and config.frees_at(done, schedule.base_steps):
+            self._free_cameras()
         if growing and config.resets_at(done):
             self._reset_opacity()
 
@@ -69,18 +72,32 @@ class Densifier:
         units = length_units(surfels.means, self.camera_centers, float(model.extent), self.config)
         self._edit(densify(surfels, self.statistics.mean(), units, self.config, step, model.generator(step)))
 
-    def _prune_by_views(self, step: int) -> None:
-        """Remove the Gaussians that too few training views show, but for what is hidden in more of them."""
-        least = self.config.least_views
-        if len(self.datamanager.train_dataset) <= 2 * least:
+    def _free_cameras(self) -> None:
+        """Remove the Gaussians that stand before a camera, where its photo shows what lies further off."""
+        if self.free is None:
             return
-        showing, framing = showing_views(self.model, self.datamanager, step)
-        self._edit(Densified.unchanged(self.model.surfels().detach()).only((showing >= least) | (framing > least)))
+        surfels = self.model.surfels().detach()
+        before = reaches_before_camera(surfels, *self.free)
+        if bool(before.any()):
+            self._edit(Densified.unchanged(surfels).only(~before), keep_statistics=True)
 
-    def _edit(self, edited: Densified) -> None:
-        model = self.model
+    def _free_depths(self) -> tuple[list[Camera], Tensor] | None:
+        """Return the training cameras and up to which depth the space before each is free; None where nobody knows."""
+        metadata = self.datamanager.train_dataparser_outputs.metadata
+        if self.config.free_share == 0.0 or metadata["points3D_random"]:
+            return None
+        cameras = [view.camera for view in self.datamanager.views("train")]
+        points = metadata["points3D_xyz"].to(self.model.device)
+        return cameras, self.config.free_share * nearest_depths(points, cameras)
+
+    def _edit(self, edited: Densified, keep_statistics: bool = False) -> None:
+        model, gathered = self.model, self.statistics
         edit_scene(model, self.adam, edited)
         self.statistics = GradientStatistics(model.num_points, model.device)
+        if keep_statistics:
+            self.statistics.total, self.statistics.views = (
+                values[edited.source] for values in (gathered.total, gathered.views)
+            )
         model.last_render = None
 
     def _reset_opacity(self) -> None:

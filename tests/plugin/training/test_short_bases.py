@@ -1,17 +1,21 @@
-"""What shortens a base: small photos first, faster rates, pruning of what too few views show."""
+"""What shortens a base, and what keeps the space before its cameras empty."""
 
 from __future__ import annotations
 
+import json
+
+import numpy as np
 import pytest
-import torch
 
 pytest.importorskip("nerfstudio")
 
-from resumed_runs import STEPS, Killed, assert_same_run, checkpoint_of, interrupted, kill_at, resume_to_end, run_to_end
+from resumed_runs import STEPS, Killed, assert_same_run, interrupted, kill_at, resume_to_end, run_to_end
 from resumed_runs import short_config as usual_config
+from run_folders import write_scene
 
 from beags_plugin.plugin.options import pyramid
 from beags_plugin.plugin.training import densifier
+from beags_plugin.system.reading.ply import write_vertices
 
 SHORT = {
     "pipeline.model.pyramid.start": 3.0,
@@ -19,8 +23,7 @@ SHORT = {
     "pipeline.model.pyramid.levels": 3,
     "pipeline.model.base_lr_factor": 3.0,
     "pipeline.model.sh_decay": 1.2,
-    "pipeline.model.densify.least_views": 2,
-    "pipeline.model.densify.least_views_every": 6,
+    "pipeline.model.densify.free_share": 0.7,
 }
 
 
@@ -64,45 +67,37 @@ def test_a_base_of_all_means_is_resumed_bit_for_bit(data, tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("stop", [31, 11])  # the scene still grows then, or no more
-def test_what_too_few_views_show_goes_but_for_what_is_hidden(data, tmp_path, monkeypatch, stop):
-    """Before the pruning some Gaussians are moved behind all cameras, which go, and some are hidden, which stay."""
-    calls, showing_views = [], densifier.showing_views
+def test_what_stands_before_a_camera_goes_while_the_base_trains(tmp_path, monkeypatch, stop):
+    """Before each round some Gaussians are moved into the space that seed points leave empty; none of them is left."""
+    data = write_scene(tmp_path / "data")
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3)).astype("<f4")
+    with open(data / "points.ply", "wb") as file:
+        write_vertices(file, points.view([(name, "<f4") for name in "xyz"])[:, 0])
+    content = json.loads((data / "transforms.json").read_text())
+    (data / "transforms.json").write_text(json.dumps(content | {"ply_file_path": "points.ply"}))
+    counts, free = [], densifier.Densifier._free_cameras
 
-    def moved(model, datamanager, step):
-        means = model.gauss_params["means"].data
-        means[::4] = 1e4
-        means[1::4] = means[2]
-        model.gauss_params["scales"].data[1::4] = -20.0  # they cover no pixel
-        calls.append((*showing_views(model, datamanager, step), len(datamanager.train_dataset)))
-        return calls[-1][:2]
+    def moved(own):
+        cameras, depths = own.free
+        means = own.model.gauss_params["means"].data
+        camera, depth = cameras[3], float(depths[3])
+        assert depth > 0
+        means[::4] = camera.center + 0.9 * depth * camera.rotation[2]
+        before = len(means)
+        free(own)
+        counts.append((before, len(own.model.gauss_params["means"])))
 
-    monkeypatch.setattr(densifier, "showing_views", moved)
-    options = {"pipeline.model.densify.least_views": 2, "pipeline.model.densify.least_views_every": 30,
+    monkeypatch.setattr(densifier.Densifier, "_free_cameras", moved)
+    options = {"pipeline.model.densify.free_share": 0.7, "pipeline.model.densify.every": 15,
                "pipeline.model.densify.stop": stop, "pipeline.model.densify.start": 10,
                "pipeline.model.refine_steps": 0}  # fmt: skip
     run_to_end(usual_config(data, tmp_path / "run", **options))
-    ((showing, framing, views),) = calls
-    assert (framing[::4] == 0).all() and (showing[::4] == 0).all() and int(framing.max()) <= views
-    assert (showing[1::4] < 2).all() and (framing[1::4] > 2).all()
-    stays = (showing >= 2) | (framing > 2)
-    means = checkpoint_of(tmp_path / "run")["pipeline"]["_model.gauss_params.means"]
-    assert len(means) == int(stays.sum()) < len(showing) and means.abs().max() < 1e3
-    assert torch.isfinite(means).all()
+    assert counts and all(after <= before - len(range(0, before, 4)) for before, after in counts)
 
 
-@pytest.mark.parametrize(("least", "enough"), [(1, True), (10, False)])
-def test_few_views_say_nothing_about_what_they_show(data, tmp_path, monkeypatch, least, enough):
-    """Views are counted where there are more than twice ``least_views``, and nowhere else, though pruning is due."""
-    views, counted = [], []
-    prune, showing_views = densifier.Densifier._prune_by_views, densifier.showing_views
-
-    def due(own, step):
-        views.append(len(own.datamanager.train_dataset))
-        prune(own, step)
-
-    monkeypatch.setattr(densifier.Densifier, "_prune_by_views", due)
-    monkeypatch.setattr(densifier, "showing_views", lambda *of: counted.append(of) or showing_views(*of))
-    option = "pipeline.model.densify.least_views"
-    run_to_end(usual_config(data, tmp_path / "run", **{option: least, f"{option}_every": 6}))
-    assert views and all((count > 2 * least) == enough for count in views)
-    assert len(counted) == (len(views) if enough else 0)
+def test_nothing_is_known_of_the_space_before_cameras_where_seed_points_were_generated(data, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(densifier, "reaches_before_camera", lambda *of: asked.append(of))
+    options = {"pipeline.model.densify.free_share": 0.7, "pipeline.model.refine_steps": 0}
+    run_to_end(usual_config(data, tmp_path / "run", **options))
+    assert not asked
