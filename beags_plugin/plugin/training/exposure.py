@@ -9,15 +9,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beags_plugin.core.exposure import Exposures, Gains, gains, sightings
+from beags_plugin.core.exposure import Exposures, Gains, gain_beside, gains, gains_beside, sightings
 from beags_plugin.export.baking import interpolated
 from beags_plugin.export.color import linear_from_srgb
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.losses.reduction import ordered_linear
+from beags_plugin.plugin.options.pyramid import small_size
 from beags_plugin.plugin.options.schedule import log_linear
 from beags_plugin.plugin.training.prepared_files import bar
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.plugin.views.dataparser import BeagsDataParser
+from beags_plugin.plugin.views.dataset import resize_area
+from beags_plugin.plugin.views.small_views import small_camera
+from beags_plugin.plugin.views.views import View, in_unit_range
+from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.system import processes
 from beags_plugin.system.progress import counted, say
 
@@ -25,6 +31,10 @@ LEAST_SPREAD = 0.05  # EV; photos whose gains differ by less are taken to be of 
 CERTAIN = 3.0  # times the noise of a gain, by which the photos' gains must differ to count as different
 RATES = 2e-3, 2e-4  # first and last learning rate of the transforms, log-linear
 TOWARDS_START = 0.05  # weight of the squared change of a photo's transform in its step
+SHOWN_AFTER = 0.25  # share of the base after which it shows how photos differ; it has absorbed a tenth of that by then
+MOST_VIEWS = 100  # rendered to tell whether photos differ
+SHORTER_SIDE = 128  # pixels of the renderings for that
+OPAQUE = 0.95  # alpha from which a pixel shows the scene, in its photo and in the rendering
 GAMMA = 2.2  # photos' values are about the 2.2nd root of light, so that a gain multiplies them by its own root
 
 
@@ -73,7 +83,10 @@ class PhotoExposures:
 
 
 def exposures_of_run(model: SceneModel, datamanager: BeagsDataManager) -> PhotoExposures | None:
-    """Return the photos' exposures to learn, those of a loaded scene where it has any; None where photos have one."""
+    """Return the photos' exposures to learn, those of a loaded scene where it has any.
+
+    None where photos have one, and where no points tell whether they have: see ``asked_of_base``.
+    """
     wanted = model.config.exposure
     if wanted == "off":
         model.exposures = None
@@ -84,20 +97,84 @@ def exposures_of_run(model: SceneModel, datamanager: BeagsDataManager) -> PhotoE
         of_name = dict(zip(known.names, known.affine.cpu(), strict=True))
         of_photos = [of_name.get(name, identity) for name, identity in zip(names, start, strict=True)]
         return PhotoExposures(model, Exposures(names, torch.stack(of_photos)))
-    found = photo_gains(datamanager)
-    learned = wanted == "on" or (found is not None and _differ(found))
-    if found is not None:
-        for line in _lines(found, names, learned):
-            say(line)
-        start[:, range(3), range(3)] = torch.from_numpy(_diagonals(found)).float()
-    return PhotoExposures(model, Exposures(names, start)) if learned else None
+    if _of_turning_objects(model, datamanager) or (found := photo_gains(datamanager)) is None:
+        return None
+    learned = wanted == "on" or _differ(found)
+    for line in _lines(found, names, learned):
+        say(line)
+    return _begun(model, names, found) if learned else None
+
+
+def asked_of_base(model: SceneModel, datamanager: BeagsDataManager) -> int | None:
+    """Return the step before which ``exposures_of_base`` is due; None where exposures are known, or not wanted."""
+    known = model.exposures is not None or _has_tracks(datamanager)
+    if known or model.config.exposure == "off" or _of_turning_objects(model, datamanager):
+        return None
+    return 0 if model.schedule.warm else int(SHOWN_AFTER * model.schedule.base_steps)
+
+
+def exposures_of_base(model: SceneModel, datamanager: BeagsDataManager) -> PhotoExposures | None:
+    """Return the photos' exposures to learn, begun at how much brighter photos are than the scene; None if alike."""
+    views = datamanager.views("train")
+    some = np.unique(np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views))).round().astype(int))
+    found = base_gains(model, datamanager, [views[index] for index in some])
+    if model.config.exposure != "on" and not _differ(found):
+        return None
+    if len(some) < len(views):
+        found = base_gains(model, datamanager, views)
+    say(_difference(found, ", as the base shows them"))
+    return _begun(model, tuple(view.name for view in views), found)
+
+
+@torch.no_grad()
+def base_gains(model: SceneModel, datamanager: BeagsDataManager, views: Sequence[View]) -> Gains:
+    """Return how bright training photos are beside small renderings of the scene.
+
+    It is rendered in the colours that do not depend on the view: the others have learned some of the difference.
+    """
+    objects = datamanager.config.photos == "objects"
+    background, settings = model.background_color.to(model.device), model.settings(geometry=False)
+
+    def beside(index: int) -> tuple[np.ndarray, float]:
+        view = views[index]
+        camera, held = view.camera, view.data()
+        size = small_size(camera.width, camera.height, min(camera.width, camera.height) / SHORTER_SIDE)
+        small = small_camera(camera, size)
+        render = model.rasterizer.rasterize(surfel_inputs(model.surfels(), small, 0), small, settings, background)
+        comparable = render.alpha.cpu().numpy() > OPAQUE
+        if (alpha := held.get("alpha")) is not None:
+            comparable &= resize_area(alpha.cpu().numpy() / np.float32(255.0), *size) > OPAQUE
+        if objects and (labels := view.labels) is not None:
+            inside = (labels != BACKGROUND) & (labels != IGNORE)
+            comparable &= resize_area(inside.float().cpu().numpy(), *size) > OPAQUE
+        photo = resize_area(in_unit_range(held["image"]).cpu().numpy(), *size)
+        return gain_beside(linear_from_srgb(photo), linear_from_srgb(render.color.cpu().numpy()), comparable)
+
+    with bar("Comparing exposures", passing=True) as progress:
+        return gains_beside(list(processes.each_view(len(views), beside, progress)))
+
+
+def _begun(model: SceneModel, names: tuple[str, ...], found: Gains) -> PhotoExposures:
+    """Return transforms that begin at the gains of photos."""
+    start = torch.eye(3, 4).repeat(len(names), 1, 1)
+    start[:, range(3), range(3)] = torch.from_numpy(_diagonals(found)).float()
+    return PhotoExposures(model, Exposures(names, start))
+
+
+def _of_turning_objects(model: SceneModel, datamanager: BeagsDataManager) -> bool:
+    """Return whether photos differ because objects turn in a light that stands, and nobody asked for exposures."""
+    return model.config.exposure == "auto" and datamanager.config.photos == "objects"
+
+
+def _has_tracks(datamanager: BeagsDataManager) -> bool:
+    return any((ids >= 0).any() for ids, _ in cast(BeagsDataParser, datamanager.dataparser).tracks("train"))
 
 
 def photo_gains(datamanager: BeagsDataManager) -> Gains | None:
     """Return how bright the training photos show the points of the COLMAP model; None without one."""
-    tracks = cast(BeagsDataParser, datamanager.dataparser).tracks("train")
-    if not any((ids >= 0).any() for ids, _ in tracks):
+    if not _has_tracks(datamanager):
         return None
+    tracks = cast(BeagsDataParser, datamanager.dataparser).tracks("train")
     places, light = [], []
     with bar("Comparing exposures", passing=True) as progress:
         for index, view in enumerate(counted(datamanager.views("train"), len(tracks), progress)):
@@ -119,14 +196,7 @@ def _differ(found: Gains) -> bool:
 def _lines(found: Gains, names: Sequence[str], learned: bool) -> Iterator[str]:
     """Yield what the user should know about the photos' gains. learned: whether photos get transforms of their own."""
     if learned:
-        means = found.stops.mean(axis=1)
-        tinted = found.spread_of_colors
-        balance = f", and their colours by {tinted:.2f} EV besides" if tinted > LEAST_SPREAD else ""
-        yield (
-            f"The photos differ in exposure by {found.spread:.2f} EV (standard deviation; {means.min():+.2f} to "
-            f"{means.max():+.2f}){balance}: each gets a colour transform of its own, and the scene has the mean "
-            "photo's exposure."
-        )
+        yield _difference(found)
     if blind := [name for name, noise in zip(names, found.noise, strict=True) if np.isinf(noise)]:
         one = len(blind) == 1
         which = f"The photo {blind[0]} shows" if one else f"{len(blind)} photos, the first of them {blind[0]}, show"
@@ -134,6 +204,18 @@ def _lines(found: Gains, names: Sequence[str], learned: bool) -> Iterator[str]:
             f"{which} no point of the scene that is neither black nor burnt out: take {'it' if one else 'them'} out of "
             "the data if nothing can be seen there."
         )
+
+
+def _difference(found: Gains, source: str = "") -> str:
+    """Return the sentence about photos that get transforms. source: of these gains, a clause."""
+    means = found.stops.mean(axis=1)
+    tinted = found.spread_of_colors
+    balance = f", and their colours by {tinted:.2f} EV besides" if tinted > LEAST_SPREAD else ""
+    return (
+        f"The photos differ in exposure by {found.spread:.2f} EV (standard deviation; {means.min():+.2f} to "
+        f"{means.max():+.2f}){balance}{source}: each gets a colour transform of its own, and the scene has the mean "
+        "photo's exposure."
+    )
 
 
 def _diagonals(found: Gains) -> np.ndarray:

@@ -39,16 +39,17 @@ class View:
     @property
     def image(self) -> Tensor:
         """[H, W, 3] float32 in 0..1, on black where it has alpha."""
-        return _in_unit_range(self.data()["image"])
+        return in_unit_range(self.data()["image"])
 
     def image_on(self, background: Tensor) -> Tensor:
         """Return the image [H, W, 3] with ``background`` [3] behind what is transparent."""
         held = self.data()
-        image, alpha = _in_unit_range(held["image"]), held.get("alpha")
+        image, alpha = in_unit_range(held["image"]), held.get("alpha")
         return image if alpha is None else image + (1.0 - alpha.float() / 255.0)[..., None] * background
 
 
-def _in_unit_range(pixels: Tensor) -> Tensor:
+def in_unit_range(pixels: Tensor) -> Tensor:
+    """Return the colours [H, W, 3] float32 in 0..1 of ``View.data``'s image."""
     return pixels[..., :3].float() / 255.0 if pixels.dtype == torch.uint8 else pixels[..., :3]
 
 

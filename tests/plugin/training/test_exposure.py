@@ -162,18 +162,6 @@ def test_white_balances_alone_count(folder, capsys):
     assert "and their colours by 0.1" in line or "and their colours by 0.2" in line
 
 
-@pytest.mark.parametrize("exposure", ["auto", "on"])
-def test_without_points_that_photos_share_only_who_asks_gets_transforms(folder, tmp_path, exposure):
-    data = shutil.copytree(folder(**EXPOSED), tmp_path / "data")
-    (data / "seed_tracks.json").unlink()
-    assert photo_gains(manager_of(data)) is None
-    own = learned(data, exposure=exposure)
-    if exposure == "auto":
-        assert own is None
-    else:
-        assert torch.equal(own.affine.detach(), torch.eye(3, 4).repeat(10, 1, 1))
-
-
 def test_the_paper_knows_none(folder):
     assert preset_config("beags-paper", {}, Path("test")).model_config.exposure == "off"
     assert preset_config("beags-fast", {}, Path("test")).model_config.exposure == "auto"
