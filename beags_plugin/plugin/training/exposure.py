@@ -9,21 +9,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beags_plugin.core.exposure import Exposures, Gains, gain_beside, gains, gains_beside, sightings
+from beags_plugin.core.exposure import Exposures, Gains, gains, sightings
 from beags_plugin.export.baking import interpolated
 from beags_plugin.export.color import linear_from_srgb
-from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.losses.reduction import ordered_linear
-from beags_plugin.plugin.options.pyramid import small_size
 from beags_plugin.plugin.options.schedule import log_linear
+from beags_plugin.plugin.training.base_gains import gains_of_colors, gains_of_points, point_cloud
 from beags_plugin.plugin.training.prepared_files import bar
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.plugin.views.dataparser import BeagsDataParser
-from beags_plugin.plugin.views.dataset import resize_area
-from beags_plugin.plugin.views.small_views import small_camera
-from beags_plugin.plugin.views.views import View, in_unit_range
-from beags_plugin.rasterizers.rendering import surfel_inputs
+from beags_plugin.plugin.views.views import View
 from beags_plugin.system import processes
 from beags_plugin.system.progress import counted, say
 
@@ -31,10 +27,9 @@ LEAST_SPREAD = 0.05  # EV; photos whose gains differ by less are taken to be of 
 CERTAIN = 3.0  # times the noise of a gain, by which the photos' gains must differ to count as different
 RATES = 2e-3, 2e-4  # first and last learning rate of the transforms, log-linear
 TOWARDS_START = 0.05  # weight of the squared change of a photo's transform in its step
-SHOWN_AFTER = 0.25  # share of the base after which it shows how photos differ; it has absorbed a tenth of that by then
+POINTS_AFTER = 0.05  # share of the base after which its depth tells which photos show a point
+COLORS_AFTER = 0.25  # share of the base after which its colours are roughly right, without points; a tenth is lost then
 MOST_VIEWS = 100  # rendered to tell whether photos differ
-SHORTER_SIDE = 128  # pixels of the renderings for that
-OPAQUE = 0.95  # alpha from which a pixel shows the scene, in its photo and in the rendering
 GAMMA = 2.2  # photos' values are about the 2.2nd root of light, so that a gain multiplies them by its own root
 
 
@@ -110,48 +105,30 @@ def asked_of_base(model: SceneModel, datamanager: BeagsDataManager) -> int | Non
     known = model.exposures is not None or _has_tracks(datamanager)
     if known or model.config.exposure == "off" or _of_turning_objects(model, datamanager):
         return None
-    return 0 if model.schedule.warm else int(SHOWN_AFTER * model.schedule.base_steps)
+    share = COLORS_AFTER if point_cloud(datamanager) is None else POINTS_AFTER
+    return 0 if model.schedule.warm else int(share * model.schedule.base_steps)
 
 
 def exposures_of_base(model: SceneModel, datamanager: BeagsDataManager) -> PhotoExposures | None:
-    """Return the photos' exposures to learn, begun at how much brighter photos are than the scene; None if alike."""
-    views = datamanager.views("train")
+    """Return the photos' exposures to learn, begun at their gains by points that the base shows, or by its colours.
+
+    None where photos have one.
+    """
+    views, points = datamanager.views("train"), point_cloud(datamanager)
+
+    def gains_of(views: Sequence[View]) -> Gains:
+        if points is None:
+            return gains_of_colors(model, datamanager, views)
+        return gains_of_points(model, datamanager, points, views)
+
     some = np.unique(np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views))).round().astype(int))
-    found = base_gains(model, datamanager, [views[index] for index in some])
+    found = gains_of([views[index] for index in some])
     if model.config.exposure != "on" and not _differ(found):
         return None
     if len(some) < len(views):
-        found = base_gains(model, datamanager, views)
+        found = gains_of(views)
     say(_difference(found, ", as the base shows them"))
     return _begun(model, tuple(view.name for view in views), found)
-
-
-@torch.no_grad()
-def base_gains(model: SceneModel, datamanager: BeagsDataManager, views: Sequence[View]) -> Gains:
-    """Return how bright training photos are beside small renderings of the scene.
-
-    It is rendered in the colours that do not depend on the view: the others have learned some of the difference.
-    """
-    objects = datamanager.config.photos == "objects"
-    background, settings = model.background_color.to(model.device), model.settings(geometry=False)
-
-    def beside(index: int) -> tuple[np.ndarray, float]:
-        view = views[index]
-        camera, held = view.camera, view.data()
-        size = small_size(camera.width, camera.height, min(camera.width, camera.height) / SHORTER_SIDE)
-        small = small_camera(camera, size)
-        render = model.rasterizer.rasterize(surfel_inputs(model.surfels(), small, 0), small, settings, background)
-        comparable = render.alpha.cpu().numpy() > OPAQUE
-        if (alpha := held.get("alpha")) is not None:
-            comparable &= resize_area(alpha.cpu().numpy() / np.float32(255.0), *size) > OPAQUE
-        if objects and (labels := view.labels) is not None:
-            inside = (labels != BACKGROUND) & (labels != IGNORE)
-            comparable &= resize_area(inside.float().cpu().numpy(), *size) > OPAQUE
-        photo = resize_area(in_unit_range(held["image"]).cpu().numpy(), *size)
-        return gain_beside(linear_from_srgb(photo), linear_from_srgb(render.color.cpu().numpy()), comparable)
-
-    with bar("Comparing exposures", passing=True) as progress:
-        return gains_beside(list(processes.each_view(len(views), beside, progress)))
 
 
 def _begun(model: SceneModel, names: tuple[str, ...], found: Gains) -> PhotoExposures:

@@ -1,8 +1,7 @@
-"""Exposures of photos that share no points: the base shows how they differ, once it is roughly right."""
+"""Exposures of photos that share no tracked points: the base shows how they differ, once it is roughly right."""
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,18 +12,17 @@ import torch
 
 pytest.importorskip("nerfstudio")
 
-from resumed_runs import assert_same_run, checkpoint_of, interrupted, kill_at, resume_to_end, run_to_end, short_config
-from training_in_processes import train_in_two
+from trackless_scenes import SMALL, written
 
 from beags_plugin.core.exposure import Exposures
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.plugin.options.schedule import PhaseSchedule
-from beags_plugin.plugin.runs.read import read_run
+from beags_plugin.plugin.training import base_gains as showing
 from beags_plugin.plugin.training import exposure as learning
+from beags_plugin.plugin.training.base_gains import gains_of_colors, gains_of_points, point_cloud
 from beags_plugin.plugin.training.exposure import (
     GAMMA,
     asked_of_base,
-    base_gains,
     exposures_of_base,
     exposures_of_run,
     photo_gains,
@@ -37,19 +35,11 @@ from beags_plugin.sample.exposure import photo_gains as true_gains
 from beags_plugin.sample.writer import SampleConfig, write_sample
 
 SAMPLE = SampleConfig(width=160, height=144, num_train=8, num_test=2, num_points=200)
-SMALL = replace(SAMPLE, width=56, height=42, num_points=600)
-BASE_STEP = 11  # of the 45 of the base
-
-
-def written(at: Path, config: SampleConfig) -> Path:
-    write_sample(at / "data", config)
-    (at / "data/seed_tracks.json").unlink()
-    return at / "data"
 
 
 @pytest.fixture(scope="module")
 def alike(shared):
-    """A sample of photos of one exposure, whose points say nothing of which photos show them."""
+    """A sample of photos of one exposure, without points."""
     return shared("trackless", lambda at: written(at, SAMPLE)) / "data"
 
 
@@ -61,21 +51,6 @@ def exposed(shared):
     )
 
 
-@pytest.fixture(scope="module")
-def small(shared):
-    return shared("trackless_small", lambda at: written(at, replace(SMALL, exposure=1.5))) / "data"
-
-
-def asking(data: Path, run: Path, **options):
-    """The config of a short run whose base begins exposures, whatever it shows."""
-    return short_config(data, run, **{"pipeline.model.exposure": "on", **options})
-
-
-@pytest.fixture(scope="module")
-def whole(shared, small):
-    return shared("trackless_run", lambda at: run_to_end(asking(small, at / "run"))) / "run"
-
-
 def manager_of(data: Path, **options) -> BeagsDataManager:
     config = BeagsDataManagerConfig(dataparser=BeagsDataParserConfig(data=data), **options)
     return BeagsDataManager(config, device="cpu", test_mode="val")
@@ -85,6 +60,7 @@ def manager_of(data: Path, **options) -> BeagsDataManager:
 class Rendered:
     color: torch.Tensor
     alpha: torch.Tensor
+    median_depth: torch.Tensor | None = None
 
 
 class TrainedOn:
@@ -102,11 +78,30 @@ class TrainedOn:
         return Rendered(color, torch.ones(camera.height, camera.width))
 
 
+class Surface:
+    """A rasterizer of a scene whose surface lies where its tracks say that views see points, and nowhere else."""
+
+    def __init__(self, manager: BeagsDataManager) -> None:
+        self.views, self.tracks = manager.views("train"), manager.dataparser.tracks("train")
+        self.points = manager.train_dataset.metadata["points3D_xyz"]
+
+    def rasterize(self, inputs, camera, settings, background) -> Rendered:
+        assert settings.geometry
+        (index,) = (i for i, v in enumerate(self.views) if torch.equal(v.camera.viewmat, camera.viewmat))
+        ids, places = self.tracks[index]
+        depth = torch.zeros(camera.height, camera.width)
+        inside = (places < 1.0).all(axis=1)
+        column, row = (places[inside] * [camera.width, camera.height]).astype(int).T
+        z = (self.points[ids[inside]] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3])[:, 2]
+        depth[row, column] = z
+        return Rendered(torch.zeros(*depth.shape, 3), (depth > 0).float(), depth)
+
+
 @dataclass
 class Model:
     """What exposures ask of a model."""
 
-    rasterizer: TrainedOn
+    rasterizer: TrainedOn | Surface
     exposure: str = "auto"
     exposures: Exposures | None = None
     device: str = "cpu"
@@ -121,8 +116,21 @@ class Model:
         empty = torch.zeros(0, 3)
         return Surfels(empty, torch.zeros(0, 4), empty[:, :2], empty[:, 0], empty, torch.zeros(0, 15, 3))
 
-    def settings(self, geometry: bool) -> RasterSettings:
+    def settings(self, geometry: bool = True) -> RasterSettings:
         return RasterSettings(0.01, 100.0, geometry)
+
+
+@pytest.fixture(scope="module")
+def cloud(shared):
+    """Photos that see points: with tracks, and without."""
+
+    def write(at: Path) -> None:
+        config = replace(SAMPLE, num_points=1200, exposure=1.2, white_balance=0.4)
+        shutil.copytree(written(at, config, points=True), at / "bare")
+        write_sample(at / "tracked", config)
+
+    at = shared("points_exposed", write)
+    return at / "tracked", at / "bare"
 
 
 def true_stops(manager: BeagsDataManager) -> np.ndarray:
@@ -152,6 +160,29 @@ def test_photos_that_a_base_shows_in_other_light_get_transforms_and_one_line_say
     assert true.std(dim=0).min() > 0.2 and (stops - true).abs().max() < 0.08
 
 
+def test_points_count_in_photos_from_which_the_base_does_not_hide_them(cloud, capsys):
+    tracked, bare = (manager_of(data) for data in cloud)
+    model, true = Model(Surface(tracked)), photo_gains(tracked)
+    assert photo_gains(bare) is None and asked_of_base(model, bare) == 5
+    found = gains_of_points(model, bare, point_cloud(bare), bare.views("train"))
+    assert true is not None and np.abs(found.stops - true.stops).max() < 0.03
+    assert found.noise == pytest.approx(true.noise, rel=0.2)
+    capsys.readouterr()
+    own = exposures_of_base(model, bare)
+    (line,) = capsys.readouterr().out.splitlines()
+    assert f"by {found.spread:.2f} EV" in line and "as the base shows them" in line
+    stops = GAMMA * torch.log2(own.affine.detach()[:, range(3), range(3)])
+    assert torch.allclose(stops - stops.mean(dim=0), torch.from_numpy(found.stops).float(), atol=1e-3)
+
+
+def test_points_of_large_clouds_are_spread_over_them(cloud, monkeypatch):
+    manager = manager_of(cloud[1])
+    every = point_cloud(manager)
+    assert len(every) == 1200
+    monkeypatch.setattr(showing, "MOST_POINTS", 500)
+    assert np.array_equal(point_cloud(manager), every[::3])
+
+
 def test_photos_that_a_base_shows_as_they_are_get_none(alike, capsys):
     model, manager = Model(TrainedOn(manager_of(alike))), manager_of(alike)
     capsys.readouterr()
@@ -176,7 +207,7 @@ def test_what_differs_within_a_photo_is_no_exposure(alike, exposed):
 def test_a_photo_that_shows_nothing_begins_at_the_identity(alike, exposed, monkeypatch):
     manager = manager_of(exposed)
     manager.cached_train[3]["image"] = torch.zeros_like(manager.cached_train[3]["image"])
-    found = base_gains(Model(TrainedOn(manager_of(alike))), manager, manager.views("train"))
+    found = gains_of_colors(Model(TrainedOn(manager_of(alike))), manager, manager.views("train"))
     assert np.isinf(found.noise[3]) and not found.stops[3].any() and np.isfinite(np.delete(found.noise, 3)).all()
     assert np.delete(found.stops, 3, axis=0).mean(axis=0) == pytest.approx(0.0, abs=1e-4)
 
@@ -195,7 +226,7 @@ def test_streamed_photos_are_compared_alike(alike, exposed):
     gains = []
     for stream in ("never", "always"):
         manager = manager_of(exposed, stream=stream)
-        gains.append(base_gains(Model(TrainedOn(manager_of(alike))), manager, manager.views("train")))
+        gains.append(gains_of_colors(Model(TrainedOn(manager_of(alike))), manager, manager.views("train")))
     assert np.array_equal(gains[0].stops, gains[1].stops) and np.array_equal(gains[0].noise, gains[1].noise)
 
 
@@ -219,60 +250,5 @@ def test_objects_that_turn_in_a_standing_light_are_no_exposures(alike, exposed, 
     assert exposures_of_run(model, manager_of(at)) is not None
     model = Model(TrainedOn(manager_of(alike)), "on")
     assert asked_of_base(model, manager) == 25 and exposures_of_base(model, manager) is not None
-    inside = base_gains(model, manager, manager.views("train"))
-    assert not np.array_equal(inside.stops, base_gains(model, manager_of(exposed), manager.views("train")).stops)
-
-
-# -- runs --------------------------------------------------------------------------------------------------------------
-
-
-def test_a_base_begins_them_at_its_step(whole, small, tmp_path):
-    exposures = read_run(whole / "config.yml").exposures
-    assert exposures is not None and torch.allclose(exposures.affine.mean(dim=0), torch.eye(3, 4), atol=1e-6)
-    part = checkpoint_of(whole)["beags"]["parts"]["exposure"]
-    assert not torch.equal(part["start"], torch.eye(3, 4).repeat(8, 1, 1))
-    assert float(part["adam"]["state"][0]["step"]) == 57 - BASE_STEP
-    fits = ["psnr_fit" in each for each in json.loads((whole / "held_out.json").read_text())]
-    assert fits == [False, *[True] * (len(fits) - 1)]
-
-
-@pytest.mark.parametrize(("step", "after"), [(8, True), (BASE_STEP, False), (BASE_STEP, True), (30, True), (50, False)])
-def test_a_killed_run_ends_as_the_whole_one(small, whole, tmp_path, monkeypatch, step, after):
-    options = {"pipeline.model.exposure": "on"}
-    interrupted(small, tmp_path / "run", monkeypatch, lambda patch: kill_at(patch, step, after), **options)
-    resume_to_end(tmp_path / "run")
-    assert_same_run(tmp_path / "run", whole)
-
-
-def test_the_number_of_threads_and_streaming_are_no_matter(small, whole, tmp_path):
-    before = torch.get_num_threads()
-    torch.set_num_threads(2 if before == 1 else 1)
-    try:
-        run_to_end(asking(small, tmp_path / "run", **{"pipeline.datamanager.stream": "always"}))
-    finally:
-        torch.set_num_threads(before)
-    assert_same_run(tmp_path / "run", whole)
-
-
-def test_a_base_that_shows_no_difference_changes_nothing(tmp_path):
-    data = written(tmp_path, SMALL)
-    run_to_end(short_config(data, tmp_path / "auto"))
-    run_to_end(short_config(data, tmp_path / "off", **{"pipeline.model.exposure": "off"}))
-    assert_same_run(tmp_path / "auto", tmp_path / "off")
-    assert "exposure" not in checkpoint_of(tmp_path / "auto")["beags"]["parts"]
-
-
-def test_a_scene_to_start_from_is_asked_at_once(small, whole, tmp_path):
-    config = asking(small, tmp_path / "run", **{"pipeline.model.base_steps": 10, "pipeline.model.refine_steps": 0})
-    config.pipeline.model.start_from = whole
-    run_to_end(config)
-    assert float(checkpoint_of(tmp_path / "run")["beags"]["parts"]["exposure"]["adam"]["state"][0]["step"]) == 10
-
-
-@pytest.mark.skipif(not torch.distributed.is_gloo_available(), reason="torch was built without gloo")
-def test_exposures_are_alike_in_two_processes(small, tmp_path):
-    data = shutil.copytree(small, tmp_path / "data")
-    train_in_two(data, tmp_path, **{"pipeline.model.exposure": "on"})
-    first, second = (json.loads((tmp_path / f"rank{rank}.json").read_text())["end"] for rank in (0, 1))
-    assert first["exposures"] is not None and first["exposures"] == second["exposures"]
-    assert first["_model.gauss_params.means"] == second["_model.gauss_params.means"]
+    inside = gains_of_colors(model, manager, manager.views("train"))
+    assert not np.array_equal(inside.stops, gains_of_colors(model, manager_of(exposed), manager.views("train")).stops)
