@@ -102,8 +102,9 @@ def exposures_of_run(model: SceneModel, datamanager: BeagsDataManager) -> PhotoE
 
 def asked_of_base(model: SceneModel, datamanager: BeagsDataManager) -> int | None:
     """Return the step before which ``exposures_of_base`` is due; None where exposures are known, or not wanted."""
-    known = model.exposures is not None or _has_tracks(datamanager)
-    if known or model.config.exposure == "off" or _of_turning_objects(model, datamanager):
+    if model.config.exposure == "off" or model.exposures is not None or _of_turning_objects(model, datamanager):
+        return None
+    if _tell(cast(BeagsDataParser, datamanager.dataparser).tracks("train")):
         return None
     share = COLORS_AFTER if point_cloud(datamanager) is None else POINTS_AFTER
     return 0 if model.schedule.warm else int(share * model.schedule.base_steps)
@@ -143,15 +144,16 @@ def _of_turning_objects(model: SceneModel, datamanager: BeagsDataManager) -> boo
     return model.config.exposure == "auto" and datamanager.config.photos == "objects"
 
 
-def _has_tracks(datamanager: BeagsDataManager) -> bool:
-    return any((ids >= 0).any() for ids, _ in cast(BeagsDataParser, datamanager.dataparser).tracks("train"))
+def _tell(tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> bool:
+    """Return whether tracks say of any point which photos show it."""
+    return any((ids >= 0).any() for ids, _ in tracks)
 
 
 def photo_gains(datamanager: BeagsDataManager) -> Gains | None:
     """Return how bright the training photos show the points of the COLMAP model; None without one."""
-    if not _has_tracks(datamanager):
-        return None
     tracks = cast(BeagsDataParser, datamanager.dataparser).tracks("train")
+    if not _tell(tracks):
+        return None
     places, light = [], []
     with bar("Comparing exposures", passing=True) as progress:
         for index, view in enumerate(counted(datamanager.views("train"), len(tracks), progress)):
