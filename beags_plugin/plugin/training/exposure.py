@@ -28,7 +28,7 @@ CERTAIN = 3.0  # times the noise of a gain, by which the photos' gains must diff
 RATES = 2e-3, 2e-4  # first and last learning rate of the transforms, log-linear
 TOWARDS_START = 0.05  # weight of the squared change of a photo's transform in its step
 POINTS_AFTER = 0.05  # share of the base after which its depth tells which photos show a point
-COLORS_AFTER = 0.25  # share of the base after which its colours are roughly right, without points; a tenth is lost then
+COLORS_AFTER = 0.5  # share of the base after which its colours tell, without points; by then they have absorbed a fifth
 MOST_VIEWS = 100  # rendered to tell whether photos differ
 GAMMA = 2.2  # photos' values are about the 2.2nd root of light, so that a gain multiplies them by its own root
 

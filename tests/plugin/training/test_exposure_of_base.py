@@ -145,7 +145,7 @@ def true_stops(manager: BeagsDataManager) -> np.ndarray:
 def test_photos_that_a_base_shows_in_other_light_get_transforms_and_one_line_says_so(alike, exposed, capsys):
     model, manager = Model(TrainedOn(manager_of(alike))), manager_of(exposed)
     assert photo_gains(manager) is None and exposures_of_run(model, manager) is None
-    assert asked_of_base(model, manager) == 25
+    assert asked_of_base(model, manager) == 50
     capsys.readouterr()
     own = exposures_of_base(model, manager)
     (line,) = capsys.readouterr().out.splitlines()
@@ -233,7 +233,7 @@ def test_streamed_photos_are_compared_alike(alike, exposed):
 def test_when_a_base_is_asked(alike, exposed, shared):
     manager, scene = manager_of(exposed), TrainedOn(manager_of(alike))
     assert asked_of_base(Model(scene, "off"), manager) is None
-    assert asked_of_base(Model(scene, "on"), manager) == 25
+    assert asked_of_base(Model(scene, "on"), manager) == 50
     assert asked_of_base(Model(scene, exposures=Exposures(("a",), torch.eye(3, 4)[None])), manager) is None
     warm = PhaseSchedule(base_steps=100, refine_steps=0, warm=True)
     assert asked_of_base(Model(scene, schedule=warm), manager) == 0
@@ -249,6 +249,6 @@ def test_objects_that_turn_in_a_standing_light_are_no_exposures(alike, exposed, 
     assert exposures_of_run(model, manager_of(at, photos="objects")) is None
     assert exposures_of_run(model, manager_of(at)) is not None
     model = Model(TrainedOn(manager_of(alike)), "on")
-    assert asked_of_base(model, manager) == 25 and exposures_of_base(model, manager) is not None
+    assert asked_of_base(model, manager) == 50 and exposures_of_base(model, manager) is not None
     inside = gains_of_colors(model, manager, manager.views("train"))
     assert not np.array_equal(inside.stops, gains_of_colors(model, manager_of(exposed), manager.views("train")).stops)
