@@ -30,7 +30,8 @@ TOWARDS_START = 0.05  # weight of the squared change of a photo's transform in i
 POINTS_AFTER = 0.05  # share of the base after which its depth tells which photos show a point
 COLORS_AFTER = 0.5  # share of the base after which its colours tell, without points; by then they have absorbed a fifth
 MOST_VIEWS = 100  # rendered to tell whether photos differ
-GAMMA = 2.2  # photos' values are about the 2.2nd root of light, so that a gain multiplies them by its own root
+GAMMA, OFFSET = 2.4, 0.055
+"""sRGB's curve but for the darkest values: (1 + OFFSET) light^(1 / GAMMA) - OFFSET, so that a gain is an affine map."""
 
 
 class PhotoExposures:
@@ -135,7 +136,9 @@ def exposures_of_base(model: SceneModel, datamanager: BeagsDataManager) -> Photo
 def _begun(model: SceneModel, names: tuple[str, ...], found: Gains) -> PhotoExposures:
     """Return transforms that begin at the gains of photos."""
     start = torch.eye(3, 4).repeat(len(names), 1, 1)
-    start[:, range(3), range(3)] = torch.from_numpy(_diagonals(found)).float()
+    factors = torch.from_numpy(_factors(found)).float()
+    start[:, range(3), range(3)] = factors
+    start[:, :, 3] = OFFSET * (factors - 1.0)
     return PhotoExposures(model, Exposures(names, start))
 
 
@@ -197,7 +200,7 @@ def _difference(found: Gains, source: str = "") -> str:
     )
 
 
-def _diagonals(found: Gains) -> np.ndarray:
-    """Return [V, 3], the factors of the photos' values that gains make, each with a mean of 1 over the photos."""
+def _factors(found: Gains) -> np.ndarray:
+    """Return [V, 3], the slopes that gains give to the photos' values, each with a mean of 1 over the photos."""
     factors = 2.0 ** (found.stops / GAMMA)
     return factors / factors.mean(axis=0)

@@ -27,6 +27,7 @@ from resumed_runs import (
 
 from beags_plugin.core.color_fit import apply_affine
 from beags_plugin.core.exposure import Exposures
+from beags_plugin.export.color import srgb_from_linear
 from beags_plugin.plugin.objects.evaluate import evaluate_run
 from beags_plugin.plugin.objects.extract import extract_objects
 from beags_plugin.plugin.objects.photos import _image
@@ -149,9 +150,11 @@ def test_photos_that_differ_get_transforms_and_one_line_says_so(folder, capsys):
     assert torch.allclose(diagonal.mean(dim=0), torch.ones(3), atol=1e-6)
     ratios = 2.0 ** ((found.stops - found.stops[0]) / GAMMA)
     assert torch.allclose(diagonal / diagonal[0], torch.from_numpy(ratios).float(), atol=1e-5)
-    off = own.affine.detach().clone()
-    off[:, range(3), range(3)] = 0.0
-    assert not off.any()
+    light = torch.linspace(0.05, 0.3, 4, dtype=torch.float64).repeat(3, 1).T.numpy()
+    for photo, slopes in enumerate(diagonal.double().numpy()):
+        seen = apply_affine(torch.from_numpy(srgb_from_linear(light)), own.affine[photo].detach())
+        factor = slopes**GAMMA
+        assert torch.allclose(seen, torch.from_numpy(srgb_from_linear(light * factor)), atol=0.02), "a gain is affine"
 
 
 def test_white_balances_alone_count(folder, capsys):
