@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 import torch
@@ -18,9 +17,6 @@ _ROUNDS = 12  # rounds of reweighting, which turn least squares into least absol
 _LEAST_RESIDUAL = 0.02  # log2 units; a smaller residual counts no more than this one
 _NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 _MEDIAN_COST = 1.25  # standard error of a median over that of a mean
-_BLOCKS = 4  # a photo is cut into as many rows and columns
-_LEAST_SHARE = 0.1  # of the pixels of a block, below which it says nothing
-_LEAST_BLOCKS = 4  # that say something, below which their photo says nothing
 _LEAST_GAIN = 0.02  # of a transform that can be inverted; a photo of less is black, and evening it out shows noise
 
 
@@ -108,40 +104,6 @@ def gains(sightings: Sightings, count: int) -> Gains:
     spread = _NORMAL * float(np.median(np.abs(residuals))) if len(logs) else 0.0
     noise = np.where(seen > 0, _MEDIAN_COST * spread / np.sqrt(np.maximum(seen, 1)), np.inf)
     return Gains(np.round(stops, 5), noise)  # Rounded, so that no last bit of a solver tells.
-
-
-def gain_beside(photo: np.ndarray, rendered: np.ndarray, comparable: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return how many stops brighter than a rendering its photo is, [3] by colour, and the noise of that.
-
-    The medians over pixels that are neither dark nor burnt out in either. The noise is the standard deviation of such
-    medians between 4 x 4 blocks, not that over the root of their number: exposure is alike in all of a photo, while
-    what a scene has wrong, and what shines, are whole regions, so that more pixels do not average them out. Zeros and
-    infinite noise where fewer than four blocks show enough.
-
-    photo, rendered: [H, W, 3] float64, linear light. comparable: [H, W] bool, pixels where both show the scene.
-    """
-    usable = comparable.copy()
-    for light in (photo, rendered):
-        usable &= ((light > DARK) & (light < BRIGHT)).all(axis=-1)
-    stops = np.log2(np.where(usable[..., None], photo, 1.0)) - np.log2(np.where(usable[..., None], rendered, 1.0))
-    bands = (np.array_split(np.arange(length), _BLOCKS) for length in usable.shape)
-    blocks = [np.ix_(rows, columns) for rows, columns in product(*bands)]
-    medians = [
-        np.median(stops[block][usable[block]], axis=0)
-        for block in blocks
-        if usable[block].sum() >= _LEAST_SHARE * usable[block].size > 0
-    ]
-    if len(medians) < _LEAST_BLOCKS:
-        return np.zeros(3), np.inf
-    return np.median(stops[usable], axis=0), float(np.sqrt(np.var(medians, axis=0, ddof=1).mean()))
-
-
-def gains_beside(found: Sequence[tuple[np.ndarray, float]]) -> Gains:
-    """Return the gains of photos from what ``gain_beside`` found for each: beside their mean, 0 where it is unknown."""
-    stops, noise = np.stack([each for each, _ in found]), np.array([each for _, each in found])
-    if (known := np.isfinite(noise)).any():
-        stops[known] -= stops[known].mean(axis=0)
-    return Gains(np.round(stops, 5), noise)
 
 
 def even_exposures(

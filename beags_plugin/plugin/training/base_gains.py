@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.exposure import Gains, gain_beside, gains, gains_beside, sightings
+from beags_plugin.core.exposure import Gains, gains, sightings
 from beags_plugin.export.baking import interpolated
 from beags_plugin.export.color import linear_from_srgb
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
@@ -20,12 +20,12 @@ from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.plugin.views.dataset import resize_area
 from beags_plugin.plugin.views.small_views import small_camera
 from beags_plugin.plugin.views.views import View, in_unit_range
-from beags_plugin.rasterizers.rendering import geometry_inputs, surfel_inputs
+from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system import processes
 
 MOST_POINTS = 8000  # of a cloud, spread over it
 SHORTER_SIDE = 128  # pixels of the renderings
-OPAQUE = 0.95  # alpha from which a pixel shows the scene, in its photo and in the rendering
+OPAQUE = 0.95  # alpha from which a pixel of a photo shows the scene
 SAME_DEPTH = 0.01  # of its depth, by which a point may lie beside the surface that hides all behind it
 
 
@@ -64,26 +64,6 @@ def gains_of_points(
     with bar("Comparing exposures", passing=True) as progress:
         ids, light = zip(*processes.each_view(len(views), seen, progress), strict=True)
     return gains(sightings(ids, light), len(views))
-
-
-@torch.no_grad()
-def gains_of_colors(model: SceneModel, datamanager: BeagsDataManager, views: Sequence[View]) -> Gains:
-    """Return how bright training photos are beside small renderings of the scene.
-
-    It is rendered in the colours that do not depend on the view: the others have learned some of the difference.
-    """
-    background, settings = model.background_color.to(model.device), model.settings(geometry=False)
-
-    def beside(index: int) -> tuple[np.ndarray, float]:
-        view, held = views[index], views[index].data()
-        camera = _small(view.camera)
-        render = model.rasterizer.rasterize(surfel_inputs(model.surfels(), camera, 0), camera, settings, background)
-        comparable = (render.alpha.cpu().numpy() > OPAQUE) & _comparable(view, held, camera, datamanager)
-        photo = resize_area(in_unit_range(held["image"]).cpu().numpy(), camera.width, camera.height)
-        return gain_beside(linear_from_srgb(photo), linear_from_srgb(render.color.cpu().numpy()), comparable)
-
-    with bar("Comparing exposures", passing=True) as progress:
-        return gains_beside(list(processes.each_view(len(views), beside, progress)))
 
 
 def _small(camera: Camera) -> Camera:

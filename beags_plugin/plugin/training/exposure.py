@@ -14,12 +14,11 @@ from beags_plugin.export.baking import interpolated
 from beags_plugin.export.color import linear_from_srgb
 from beags_plugin.losses.reduction import ordered_linear
 from beags_plugin.plugin.options.schedule import log_linear
-from beags_plugin.plugin.training.base_gains import gains_of_colors, gains_of_points, point_cloud
+from beags_plugin.plugin.training.base_gains import gains_of_points, point_cloud
 from beags_plugin.plugin.training.prepared_files import bar
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.plugin.views.dataparser import BeagsDataParser
-from beags_plugin.plugin.views.views import View
 from beags_plugin.system import processes
 from beags_plugin.system.progress import counted, say
 
@@ -28,7 +27,6 @@ CERTAIN = 3.0  # times the noise of a gain, by which the photos' gains must diff
 RATES = 2e-3, 2e-4  # first and last learning rate of the transforms, log-linear
 TOWARDS_START = 0.05  # weight of the squared change of a photo's transform in its step
 POINTS_AFTER = 0.05  # share of the base after which its depth tells which photos show a point
-COLORS_AFTER = 0.5  # share of the base after which its colours tell, without points; by then they have absorbed a fifth
 MOST_VIEWS = 100  # rendered to tell whether photos differ
 GAMMA, OFFSET = 2.4, 0.055
 """sRGB's curve but for the darkest values: (1 + OFFSET) light^(1 / GAMMA) - OFFSET, so that a gain is an affine map."""
@@ -81,7 +79,8 @@ class PhotoExposures:
 def exposures_of_run(model: SceneModel, datamanager: BeagsDataManager) -> PhotoExposures | None:
     """Return the photos' exposures to learn, those of a loaded scene where it has any.
 
-    None where photos have one, and where no points tell whether they have: see ``asked_of_base``.
+    None where photos have one, and where the base is to show whether they have: see ``asked_of_base``. Those that are
+    wanted where no points tell begin at the identity.
     """
     wanted = model.config.exposure
     if wanted == "off":
@@ -93,8 +92,11 @@ def exposures_of_run(model: SceneModel, datamanager: BeagsDataManager) -> PhotoE
         of_name = dict(zip(known.names, known.affine.cpu(), strict=True))
         of_photos = [of_name.get(name, identity) for name, identity in zip(names, start, strict=True)]
         return PhotoExposures(model, Exposures(names, torch.stack(of_photos)))
-    if _of_turning_objects(model, datamanager) or (found := photo_gains(datamanager)) is None:
+    if _of_turning_objects(model, datamanager):
         return None
+    if (found := photo_gains(datamanager)) is None:
+        blind = wanted == "on" and point_cloud(datamanager) is None
+        return PhotoExposures(model, Exposures(names, start)) if blind else None
     learned = wanted == "on" or _differ(found)
     for line in _lines(found, names, learned):
         say(line)
@@ -102,33 +104,30 @@ def exposures_of_run(model: SceneModel, datamanager: BeagsDataManager) -> PhotoE
 
 
 def asked_of_base(model: SceneModel, datamanager: BeagsDataManager) -> int | None:
-    """Return the step before which ``exposures_of_base`` is due; None where exposures are known, or not wanted."""
+    """Return the step before which ``exposures_of_base`` is due.
+
+    None where exposures are known or not wanted, and without points, of which the base shows where they are hidden.
+    """
     if model.config.exposure == "off" or model.exposures is not None or _of_turning_objects(model, datamanager):
         return None
-    if _tell(cast(BeagsDataParser, datamanager.dataparser).tracks("train")):
+    if point_cloud(datamanager) is None or _tell(cast(BeagsDataParser, datamanager.dataparser).tracks("train")):
         return None
-    share = COLORS_AFTER if point_cloud(datamanager) is None else POINTS_AFTER
-    return 0 if model.schedule.warm else int(share * model.schedule.base_steps)
+    return 0 if model.schedule.warm else int(POINTS_AFTER * model.schedule.base_steps)
 
 
 def exposures_of_base(model: SceneModel, datamanager: BeagsDataManager) -> PhotoExposures | None:
-    """Return the photos' exposures to learn, begun at their gains by points that the base shows, or by its colours.
+    """Return the photos' exposures to learn, begun at their gains by points [P, 3] that the base shows.
 
-    None where photos have one.
+    None where photos have one. It is asked of data that have points alone, see ``asked_of_base``.
     """
     views, points = datamanager.views("train"), point_cloud(datamanager)
-
-    def gains_of(views: Sequence[View]) -> Gains:
-        if points is None:
-            return gains_of_colors(model, datamanager, views)
-        return gains_of_points(model, datamanager, points, views)
-
+    assert points is not None
     some = np.unique(np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views))).round().astype(int))
-    found = gains_of([views[index] for index in some])
+    found = gains_of_points(model, datamanager, points, [views[index] for index in some])
     if model.config.exposure != "on" and not _differ(found):
         return None
     if len(some) < len(views):
-        found = gains_of(views)
+        found = gains_of_points(model, datamanager, points, views)
     say(_difference(found, ", as the base shows them"))
     return _begun(model, tuple(view.name for view in views), found)
 

@@ -17,6 +17,7 @@ from trackless_scenes import SMALL, written
 from training_in_processes import train_in_two
 
 from beags_plugin.plugin.runs.read import read_run
+from beags_plugin.plugin.training import exposure as learning
 
 BASE_STEP = 2  # of the 45 of the base
 
@@ -64,12 +65,22 @@ def test_the_number_of_threads_and_streaming_are_no_matter(small, whole, tmp_pat
     assert_same_run(tmp_path / "run", whole)
 
 
-def test_a_base_that_shows_no_difference_changes_nothing(tmp_path):
-    data = written(tmp_path, SMALL)
+def test_a_base_that_shows_no_difference_changes_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(learning, "LEAST_SPREAD", 1.0)  # After two steps the surface is not yet right.
+    data = written(tmp_path, SMALL, points=True)
+    asked, found = [], learning.gains_of_points
+    monkeypatch.setattr(learning, "gains_of_points", lambda *given: asked.append(given) or found(*given))
     run_to_end(short_config(data, tmp_path / "auto"))
     run_to_end(short_config(data, tmp_path / "off", **{"pipeline.model.exposure": "off"}))
     assert_same_run(tmp_path / "auto", tmp_path / "off")
-    assert "exposure" not in checkpoint_of(tmp_path / "auto")["beags"]["parts"]
+    assert "exposure" not in checkpoint_of(tmp_path / "auto")["beags"]["parts"] and len(asked) == 1
+
+
+def test_without_any_point_they_begin_at_the_identity_with_the_run(tmp_path):
+    run_to_end(asking(written(tmp_path, replace(SMALL, exposure=1.5)), tmp_path / "run"))
+    part = checkpoint_of(tmp_path / "run")["beags"]["parts"]["exposure"]
+    assert torch.equal(part["start"], torch.eye(3, 4).repeat(8, 1, 1))
+    assert float(part["adam"]["state"][0]["step"]) == 57
 
 
 def test_a_scene_to_start_from_is_asked_at_once(small, whole, tmp_path):
