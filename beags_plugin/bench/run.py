@@ -133,6 +133,8 @@ def adapted(experiment: Experiment, options: ExperimentOptions) -> Experiment:
             check_choice(name, known, "variant", f" of {experiment.name}")
         wanted = {*options.variants, experiment.reference}  # "cob-gs" stands for "cob-gs, one scene" too
         chosen = tuple(v for v in experiment.variants if {v.name, v.name.split(", ")[0]} & wanted)
+        controls = {variant.control for variant in chosen}
+        chosen = tuple(v for v in experiment.variants if v in chosen or v.name in controls)
         experiment = dataclasses.replace(experiment, variants=chosen)
     if options.preset is not None:
         experiment = dataclasses.replace(experiment, preset=options.preset)

@@ -50,9 +50,8 @@ class DensifyConfig:
     """Training pixels that each Gaussian needs at least, against overfitting of few images; 0, as officially, sets no
     bound."""
     free_share: float = 0.0
-    """Gaussians go that stand before a camera nearer than this share of the depth of the nearest seed points that it
-    shows: hardly another photo shows them, and held-out ones are covered by them. 0 keeps them, as does a scene whose
-    seed points were generated."""
+    """Share of the depth of the nearest seed points that a camera shows. Gaussians that reach nearer to that camera are
+    removed: they cover held-out photos. 0 keeps them, as does a scene whose seed points were generated."""
 
     def scaled(self, factor: float) -> DensifyConfig:
         """Return the same for a run ``factor`` times as long: its steps are scaled, within the smallest intervals."""

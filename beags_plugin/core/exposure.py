@@ -12,7 +12,7 @@ from torch import Tensor
 from beags_plugin.core.color_fit import apply_affine
 
 DARK, BRIGHT = 0.02, 0.95  # Linear light; outside this range noise and clipping say nothing about exposure.
-_RIDGE = 1e-3  # share of all photos' mean evidence, for photos that share no place with others
+_RIDGE = 1e-3  # It keeps photos that share no place with others solvable: a share of all photos' mean evidence.
 _ROUNDS = 12  # rounds of reweighting, which turn least squares into least absolute differences
 _LEAST_RESIDUAL = 0.02  # log2 units; a smaller residual counts no more than this one
 _NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
@@ -87,9 +87,12 @@ def gains(sightings: Sightings, count: int) -> Gains:
     """Return the gains of ``count`` photos that explain best in which light they show the same places.
 
     log2 light of place p in photo v = log2 colour of p + gain of v, for the least absolute difference by reweighted
-    least squares: reflections and wrong matches are outliers.
+    least squares: reflections and wrong matches are outliers. A place counts that two photos or more show neither dark
+    nor bright.
     """
     usable = ((sightings.light > DARK) & (sightings.light < BRIGHT)).all(axis=1)
+    _, inverse = np.unique(sightings.place, return_inverse=True)
+    usable &= np.bincount(inverse[usable], minlength=len(inverse))[inverse] > 1
     place, photo = np.unique(sightings.place[usable], return_inverse=True)[1], sightings.photo[usable]
     logs = np.log2(sightings.light[usable])
     stops, residuals = np.zeros((count, 3)), np.zeros_like(logs)

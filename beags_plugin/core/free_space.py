@@ -15,7 +15,7 @@ from beags_plugin.core.surfels import Surfels
 NEAREST = 0.02  # share of a view's points that may be wrong, and lie too near
 LEAST_POINTS = 20  # a view that shows fewer points says nothing
 REACH = 2.0  # standard deviations of a Gaussian along an axis that count as its own
-MARGIN = 0.1  # of the picture's width and height, by which what stands beside it counts too
+MARGIN = 0.1  # What stands beside a picture by this share of its width or height counts too.
 
 
 def nearest_depths(points: Tensor, cameras: Sequence[Camera]) -> Tensor:

@@ -102,7 +102,7 @@ def evaluate_scene(
                 for class_id, exact, silhouette, known in removals(view, [] if objects_alone else objects):
                     assert members is not None
                     rest = renderer.image(remove_class(surfels, members, class_id)[0], background)
-                    if colors_fitted:  # by the fit with the object, lest a fit of its own hide remains
+                    if colors_fitted:  # The fit is that with the object: one of its own would hide what remains.
                         rest = fitted_colors(rest, affine).to(rest)
                     known = None if known is None else known.to(rest.device)
                     metrics = removal_metrics(rest, photo, exact.to(rest), silhouette.to(rest.device), known)

@@ -43,12 +43,13 @@ def read_id_mask(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarray
     return labels
 
 
-def read_object_mask(path: Path | str) -> np.ndarray:
+def read_object_mask(path: Path | str, truth: bool = False) -> np.ndarray:
     """Read the mask of one object, [H, W] uint16: 1 inside, 0 outside, IGNORE where that cannot be told.
 
     In 8-bit grey or colour images that reach 128, pixels are inside from 128 on, as outlines may be blended. But in an
     image of no other values than 0, 128 and 255, with 255 in it, grey 128 is ``UNTOLD``: a blended outline has more
     shades. In other images, such as labels 0 and 1, all but 0 and IGNORE is inside. Alpha is ignored.
+    truth: whether 128 is ``UNTOLD`` without 255 too, as in a silhouette of which nothing can be told.
     Raises ``UserError`` for any other file, a photo among them.
     """
     mode, values = _read_pixels(path)
@@ -64,7 +65,7 @@ def read_object_mask(path: Path | str) -> np.ndarray:
             raise UserError(f"the mask {path} is a picture: fill the object white on black, without the photo below.")
         shades = set(np.unique(channels).tolist())
         inside, untold = brightest >= UNTOLD, (channels == UNTOLD).all(axis=2)
-        untold &= 255 in shades and shades <= {0, UNTOLD, 255}
+        untold &= (255 in shades or truth) and shades <= {0, UNTOLD, 255}
     else:
         inside, untold = brightest != 0, brightest == IGNORE
     return np.where(untold, IGNORE, inside).astype(np.uint16)

@@ -169,7 +169,7 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
         (folder / sub).mkdir(parents=True)
     seeds: list[SeedPoints] = []
     surfaces: list[list[np.ndarray]] = [[] for _ in shots[0].still.things]
-    photos: list[Photo] = []  # of training
+    photos: list[Photo] = []  # those to train on
     silhouettes: dict[str, np.ndarray] = {}
     for done, shot in enumerate(shots, start=1):
         view, scene = shot.view, shot.scene

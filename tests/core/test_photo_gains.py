@@ -92,6 +92,17 @@ def test_black_and_burnt_out_sightings_say_nothing():
     assert np.abs(differences).max() < 3e-3
 
 
+def test_a_place_that_one_photo_alone_shows_is_no_evidence():
+    told = seen(stops := some_stops(), noise=0.1)
+    lone = np.arange(1000) + told.place.max() + 1
+    light = np.full((1000, 3), 0.1)
+    more = Sightings(
+        np.append(told.place, lone), np.append(told.photo, np.zeros(1000, int)), np.append(told.light, light, axis=0)
+    )
+    found, plain = gains(more, len(stops)), gains(told, len(stops))
+    assert np.array_equal(found.stops, plain.stops) and np.array_equal(found.noise, plain.noise)
+
+
 def test_groups_of_photos_without_a_common_place_have_the_same_mean():
     stops = some_stops(10)
     found = gains(seen(stops, group=4), 10)

@@ -201,3 +201,10 @@ def test_names_that_could_not_be_read_back_are_refused():
     ):
         with pytest.raises(UserError, match=message):
             check_names(wrong)
+
+
+def test_a_silhouette_of_which_nothing_can_be_told_holds_no_object(tmp_path):
+    Image.fromarray(np.minimum(TOLD, 128)).save(path := tmp_path / "mask.png")
+    assert (read_object_mask(path, truth=True) == np.where(TOLD >= 128, IGNORE, 0)).all()
+    Image.fromarray(GREY).save(path)
+    assert (read_object_mask(path, truth=True) == (GREY >= 128)).all(), "blended outlines stay what they are"

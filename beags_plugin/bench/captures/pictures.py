@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 SIDE = 200  # pixels of a picture of an object, and height of one of the scene
 AROUND, ABOVE = 4, 20.0  # pictures on a circle, degrees above the horizon
 BENEATH, BELOW = 2, -35.0
-STRAYS = 0.03  # of an object's Gaussians, at each end of each axis
-MARGIN = 0.1  # around the others, in sides of their box
+STRAYS = 0.03  # share of an object's Gaussians at each end of each axis that are left out of the picture
+MARGIN = 0.1  # space around the others, in sides of their box
 LETTER = 7  # pixels of one in a caption, at most
 
 

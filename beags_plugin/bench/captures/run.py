@@ -135,7 +135,7 @@ def _make_masks(captures: Sequence[MaskedCapture], output: Path, engine: Engine,
     return failed
 
 
-def _rows(runs: Sequence[VariantTrial], outcomes: Mapping[str, Outcome], failed: Mapping[str, str]) -> list[ResultRow]:
+def _rows(runs: Sequence[VariantTrial], outcomes: dict[str, Outcome], failed: Mapping[str, str]) -> list[ResultRow]:
     """Return a row for every run, in order."""
     rows = []
     for run in runs:

@@ -111,7 +111,7 @@ class HeldOutViews(Sequence[EvalView]):
         """Read the [h, w] bool masks of a view by object id, and what of them cannot be told, if anything."""
         masks, unknown = {}, {}
         for class_id, file in self._files(files, view).items():
-            ids = self._straight(file, read_object_mask(file), view)
+            ids = self._straight(file, read_object_mask(file, truth=True), view)
             masks[class_id] = torch.from_numpy(ids == 1)
             if (untold := ids == IGNORE).any():  # outside the lens too
                 unknown[class_id] = torch.from_numpy(untold)

@@ -15,7 +15,7 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import load_json, reason
 
 Tracks = list[tuple[np.ndarray, np.ndarray]]
-"""Of each view the points of a COLMAP model that it saw: rows [N], and places [N, 2] in 0..1; empty without a model."""
+"""Points that each view saw: ids [N], -1 for no point, and places [N, 2] in 0..1; empty where nothing tells."""
 
 SEED_TRACKS = "seed_tracks.json"
 """File of a scene that says which photos show its seed points: {"photos": [stems], "points": [[indices], ...]}."""
