@@ -54,5 +54,5 @@ def reaches_before_camera(surfels: Surfels, cameras: Sequence[Camera], depths: T
 def _framed(points: Tensor, camera: Camera, margin: float) -> tuple[Tensor, Tensor]:
     """Return which points [P, 3] lie in a camera's picture, widened by ``margin``, [P] bool, and their depths [P]."""
     xy, z = project(points, camera)
-    share = xy / torch.tensor([camera.width, camera.height], dtype=xy.dtype, device=xy.device)
-    return (z > 0) & (share > -margin).all(dim=1) & (share < 1.0 + margin).all(dim=1), z
+    x, y = xy[:, 0] / camera.width, xy[:, 1] / camera.height
+    return (z > 0) & (x > -margin) & (x < 1.0 + margin) & (y > -margin) & (y < 1.0 + margin), z
