@@ -267,7 +267,7 @@ def test_costs_are_beside_the_control_of_the_same_scenes():
 
 
 def test_rows_refine_as_the_presets_that_they_name():
-    """The paper's row is beags-paper but for k; every other row has a control of its length, and costs beside it."""
+    """The paper's row is beags-paper but for k and the exposures of the base; every other row has a control of its length."""
     experiment = load_experiment(str(ROWS))
     by_name = {variant.name: variant for variant in experiment.variants}
     trials = {run.variant.name: run.trial for run in plan(experiment, [TrialScene("a", Path("/a"), 1.0, "1")], {}, "")}
@@ -275,7 +275,8 @@ def test_rows_refine_as_the_presets_that_they_name():
     models = {name: preset_config(t.preset, t.overrides, Path()).model_config for name, t in trials.items()}
     paper = preset_config("beags-paper", {MODEL + "base_steps": 0}, Path()).model_config
     own = models["the paper's losses"]
-    assert replace(own, prepare=replace(own.prepare, k_pixels=0)) == paper and own.prepare.k_pixels == 120_000_000
+    assert replace(own, exposure="off", prepare=replace(own.prepare, k_pixels=0)) == paper
+    assert own.exposure == "auto" and own.prepare.k_pixels == 120_000_000
     assert (own.refine_steps, own.losses["boundary"].weight, own.losses["occupancy"].weight) == (3000, 0.5, 10.0)
     assert (own.split.rounds, own.prepare.unseen, own.losses["silhouette"].weight) == (0, False, 0.0)
     for name in ("beags-refine", "beags-fast"):

@@ -23,10 +23,10 @@ from beags_plugin.plugin.views.views import View, in_unit_range
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system import processes
 
-MOST_POINTS = 8000  # of a cloud, spread over it
+MOST_POINTS = 8000  # A larger cloud is thinned to about as many points.
 SHORTER_SIDE = 128  # pixels of the renderings
 OPAQUE = 0.95  # alpha from which a pixel of a photo shows the scene
-SAME_DEPTH = 0.01  # of its depth, by which a point may lie beside the surface that hides all behind it
+SAME_DEPTH = 0.01  # A point may lie beside the rendered surface by this share of its depth.
 
 
 def point_cloud(datamanager: BeagsDataManager) -> np.ndarray | None:

@@ -83,8 +83,10 @@ class Densifier:
 
     def _free_depths(self) -> tuple[list[Camera], Tensor] | None:
         """Return the training cameras and up to which depth the space before each is free; None where nobody knows."""
+        if self.config.free_share == 0.0:
+            return None
         metadata = self.datamanager.train_dataparser_outputs.metadata
-        if self.config.free_share == 0.0 or metadata["points3D_random"]:
+        if metadata["points3D_random"]:
             return None
         cameras = [view.camera for view in self.datamanager.views("train")]
         points = metadata["points3D_xyz"].to(self.model.device)
