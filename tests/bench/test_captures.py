@@ -267,7 +267,7 @@ def test_costs_are_beside_the_control_of_the_same_scenes():
 
 
 def test_rows_refine_as_the_presets_that_they_name():
-    """The paper's row is beags-paper but for k and the exposures of the base; every other row has a control of its length."""
+    """The paper's row is beags-paper but for k and exposures; every other row has a control of its length."""
     experiment = load_experiment(str(ROWS))
     by_name = {variant.name: variant for variant in experiment.variants}
     trials = {run.variant.name: run.trial for run in plan(experiment, [TrialScene("a", Path("/a"), 1.0, "1")], {}, "")}
