@@ -87,7 +87,7 @@ def test_black_and_burnt_out_sightings_say_nothing():
     found = gains(Sightings(shown.place, shown.photo, light), 8)
     rest = [0, 1, 2, 4, 5, 6, 7]
     assert np.isinf(found.noise[3]) and np.isfinite(found.noise[rest]).all()
-    assert np.abs(found.stops[3] - found.stops[3].mean()).max() < 0.02  # of no colour of its own
+    assert np.abs(found.stops[3] - found.stops[3].mean()).max() < 0.02  # The photo has no tint.
     differences = found.stops[rest] - found.stops[rest].mean(axis=0) - (stops[rest] - stops[rest].mean(axis=0))
     assert np.abs(differences).max() < 3e-3
 
@@ -121,7 +121,7 @@ def test_order_of_photos_places_and_sightings_is_no_matter():
     shown = seen(stops, places=60, noise=0.1, outliers=0.1)
     found = gains(shown, 6)
     generator = np.random.default_rng(5)
-    photos, places = generator.permutation(6), generator.permutation(60) * 1000  # with gaps between the ids
+    photos, places = generator.permutation(6), generator.permutation(60) * 1000  # Ids have gaps.
     order = generator.permutation(len(shown.place))
     moved = Sightings(places[shown.place][order], photos[shown.photo][order], shown.light[order])
     other = gains(moved, 6)

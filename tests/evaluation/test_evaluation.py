@@ -37,7 +37,7 @@ from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 from beags_plugin.system.errors import UserError
 
 STRAY = (20.0, 20.0, 2.0)
-IDS = torch.tensor([1, 2, 0], dtype=torch.int32)  # of cup, box and floor
+IDS = torch.tensor([1, 2, 0], dtype=torch.int32)  # cup, box, floor
 RENDERED = MaskMetrics(1.0, 1.0, 1.0)
 PERFECT = ObjectMetrics(replace(RENDERED, spill=0.0), RENDERED)
 

@@ -19,7 +19,7 @@ from beags_plugin.evaluation.report import CSV_COLUMNS, RunMetrics, data_set
 from beags_plugin.evaluation.run_metrics import evaluate_scene, psnr_after_fit
 from beags_plugin.evaluation.table import protocol_line, render_data_set, render_run
 
-COLORS = torch.tensor([[0.9, 0.1, 0.4], [0.2, 0.7, 0.3], [0.5, 0.5, 0.8]])  # of cup, box and floor
+COLORS = torch.tensor([[0.9, 0.1, 0.4], [0.2, 0.7, 0.3], [0.5, 0.5, 0.8]])  # cup, box, floor
 IDS = torch.tensor([1, 2, 0], dtype=torch.int32)
 
 

@@ -21,7 +21,7 @@ from beags_plugin.pictures.worst_views import LEFT_OUT, draw_worst
 X, Y, HALF = CUP
 UNTOLD = square_mask(*CUP) & (torch.arange(SIZE) < X)  # the cup's left half
 TOLD = square_mask(*CUP) & ~UNTOLD
-QUARTERS = [(X + HALF / 2, y, HALF / 2) for y in (Y - HALF / 2, Y + HALF / 2)]  # of the cup, that are told
+QUARTERS = [(X + HALF / 2, y, HALF / 2) for y in (Y - HALF / 2, Y + HALF / 2)]  # the cup's told quarters
 STRAY = (20.0, 20.0, 1.5)  # two by two pixels
 
 

@@ -98,7 +98,7 @@ def test_one_image_per_object_in_either_order(tmp_path):
         assert names == {0: "background", 1: "box", 2: "cup"} and maps[2:] == [None, None]
         for index in range(2):
             np.testing.assert_array_equal(maps[index], np.array([0, 2, 1])[truth(index)])
-    untold = np.where(truth(0) == 0, np.uint8(128), np.uint8(255))  # of the cup cannot be told where it ends
+    untold = np.where(truth(0) == 0, np.uint8(128), np.uint8(255))  # Nobody can tell where the cup ends.
     write_image(tmp_path / "a/cup/v0.png", untold)
     _, maps = make(ObjectImagesSource(Path("a")), scene)
     np.testing.assert_array_equal(maps[0], np.array([IGNORE, 2, 1])[truth(0)])

@@ -47,7 +47,7 @@ CAPTURES = (
     Capture("garden", (PICKED,), ("vase", "table")),
     Capture("fruit", (GIVEN,), ("apple", "banana")),
     Capture("dtu_skull", (GIVEN, SALIENT), own_truth=True),
-    Capture("figurine", (SALIENT,)),  # for pictures, as fern
+    Capture("figurine", (SALIENT,)),  # It and fern have no truth and serve pictures.
     Capture("fern", (PICKED,)),
 )
 """The network marks one object, so it serves the captures of one."""

@@ -162,7 +162,7 @@ def photo_gains(datamanager: BeagsDataManager) -> Gains | None:
             image = view.image.cpu()
             ids, shares = tracks[index]
             xy = datamanager.straightened(shares, index, "train")[1]
-            inside = ((xy >= 0) & (xy < image.shape[1::-1])).all(axis=1)  # without its lens a photo shows less
+            inside = ((xy >= 0) & (xy < image.shape[1::-1])).all(axis=1)  # Without its lens a photo shows less.
             places.append(np.where(inside, ids, -1))
             light.append(linear_from_srgb(interpolated(image, xy)))
     return gains(sightings(places, light), len(tracks))

@@ -113,7 +113,7 @@ class HeldOutViews(Sequence[EvalView]):
         for class_id, file in self._files(files, view).items():
             ids = self._straight(file, read_object_mask(file, truth=True), view)
             masks[class_id] = torch.from_numpy(ids == 1)
-            if (untold := ids == IGNORE).any():  # outside the lens too
+            if (untold := ids == IGNORE).any():  # Pixels outside the lens cannot be told either.
                 unknown[class_id] = torch.from_numpy(untold)
         return masks, unknown
 

@@ -37,7 +37,7 @@ def test_exposures_pass_and_are_read_as_they_were():
     validate(state(_extra_state=extra), Path("a.ckpt"))
     found = exposures_of(extra)
     assert found is not None and found.names == ("a", "b") and torch.equal(found.affine, exposures.affine)
-    exposures.affine.zero_()  # as training would go on
+    exposures.affine.zero_()  # Training goes on.
     assert found.affine.any()
     assert exposures_of({"classes": {}}) is None and "exposures" not in extra_state({}, members)
 

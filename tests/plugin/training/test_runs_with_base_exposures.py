@@ -19,7 +19,7 @@ from training_in_processes import train_in_two
 from beags_plugin.plugin.runs.read import read_run
 from beags_plugin.plugin.training import exposure as learning
 
-BASE_STEP = 2  # of the 45 of the base
+BASE_STEP = 2  # The base has 45 steps.
 
 
 @pytest.fixture(scope="module")

@@ -37,7 +37,7 @@ def test_truth_without_a_photo_is_named_and_the_rest_counts(tmp_path, capsys):
     truth = data / "ground_truth"
     shutil.copy(truth / "silhouettes/cup/v00.png", truth / "silhouettes/cup/w05.png")
     shutil.copy(truth / "silhouettes/cup/v00.png", truth / "silhouettes/cup/v01.png")  # a training photo has it
-    shutil.copytree(truth / "silhouettes/cup", truth / "visible/box/deep")  # at no photo's path
+    shutil.copytree(truth / "silhouettes/cup", truth / "visible/box/deep")  # No photo has this path.
     for name in ("v01", "w05"):
         (truth / f"visible/box/deep/{name}.png").unlink()
     capsys.readouterr()
@@ -57,4 +57,4 @@ def test_truth_of_another_scene_is_named_and_nothing_ends(tmp_path):
         f"No exact mask in {data}/ground_truth has the name of a photo here (v00.png, ...), so none counts: name them "
         "as their photos, or remove them if they are of another scene."
     )
-    assert views[0].silhouettes is None and views[0].visible is not None  # by the scene's own masks
+    assert views[0].silhouettes is None and views[0].visible is not None  # The scene's own masks serve.
