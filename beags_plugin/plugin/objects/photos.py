@@ -34,8 +34,10 @@ def _image(shown: ShownScene, view: int) -> Tensor:
 
 
 def _own(shown: ShownScene, view: int, class_id: int | None) -> Tensor:
+    """Return the pixels [H, W] bool of a class; evened exposures make grey of burnt-out ones, so these are left out."""
     labels = shown.views.labels[view].cpu()
-    return torch.ones_like(labels, dtype=torch.bool) if class_id is None else labels == class_id
+    own = torch.ones_like(labels, dtype=torch.bool) if class_id is None else labels == class_id
+    return own if shown.exposures is None else own & (shown.photos[view].image.cpu() < 1.0).any(dim=2)
 
 
 def _depth(shown: ShownScene, view: int, scale: float) -> Callable[[], Tensor]:

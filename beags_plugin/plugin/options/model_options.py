@@ -47,7 +47,7 @@ class BeagsModelConfig(ModelConfig):
     elsewhere."""
     exposure: Literal["auto", "on", "off"] = "auto"
     """Whether each training photo gets an affine colour transform of its own, learned with the scene, which then has
-    the mean photo's exposure; auto: where points that photos share, or that the base shows, tell that these differ."""
+    the mean photo's exposure; auto: where points that photos share tell that these differ."""
     start_from: Path | None = None
     """A trained scene to start from instead of seed points: a 3DGS or 2DGS .ply, or a run of splatfacto or beags. 3D
     Gaussians are flattened. base_steps then polish it, without growth."""

@@ -11,12 +11,7 @@ from beags_plugin.core.cameras import camera_extent
 from beags_plugin.plugin.options.pyramid import small_size
 from beags_plugin.plugin.options.schedule import log_linear
 from beags_plugin.plugin.training.densifier import Densifier
-from beags_plugin.plugin.training.exposure import (
-    PhotoExposures,
-    asked_of_base,
-    exposures_of_base,
-    exposures_of_run,
-)
+from beags_plugin.plugin.training.exposure import exposures_of_run
 from beags_plugin.plugin.training.monitor import Curves
 from beags_plugin.plugin.training.optimizers import SceneOptimizer
 from beags_plugin.plugin.training.refinement import RefinementSwitch
@@ -41,14 +36,9 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
     switch.ask_steps()
     for name, part in {"views": datamanager, "densification": densifier, "refinement": switch}.items():
         trainer.keep(name, part)
-
-    def expose(exposure: PhotoExposures | None) -> None:
-        model.photo_colors = exposure
-        if exposure is not None:
-            trainer.keep("exposure", exposure)
-
-    expose(exposures_of_run(model, datamanager))
-    asked = asked_of_base(model, datamanager)
+    exposure = model.photo_colors = exposures_of_run(model, datamanager)
+    if exposure is not None:
+        trainer.keep("exposure", exposure)
     curves = _curves(model, trainer, datamanager)
     if curves is not None:
         trainer.keep("curves", curves)
@@ -57,8 +47,6 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
         trainer.stop_if_asked(step)
         model.step = step
         every = trainer.config.logging.steps_per_log
-        if step == asked:
-            expose(exposures_of_base(model, datamanager))
         model.measuring = every > 0 and step % every == 0  # nerfstudio reads no other step's
         densifier.before_step(step)
         switch.before_step(step)
@@ -69,8 +57,8 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
         own_learning_rates(model, adam, step)
 
     def after(step: int) -> None:
-        if isinstance(model.photo_colors, PhotoExposures):
-            model.photo_colors.after_step(step)
+        if exposure is not None:
+            exposure.after_step(step)
         densifier.after_step(step)
         model.clock.mark("growth")
         switch.after_step(step)

@@ -15,6 +15,9 @@ from beags_plugin.plugin.training.scene_edits import edit_scene, move_adam_state
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system import processes
+from beags_plugin.system.progress import say
+
+MOST_FREED = 0.2  # share of the Gaussians; where more reach before cameras, seed points tell too little of what is near
 
 
 class Densifier:
@@ -73,12 +76,19 @@ class Densifier:
         self._edit(densify(surfels, self.statistics.mean(), units, self.config, step, model.generator(step)))
 
     def _free_cameras(self) -> None:
-        """Remove the Gaussians that stand before a camera, where its photo shows what lies further off."""
+        """Remove the Gaussians that stand before a camera, where its photo shows what lies further off.
+
+        Nothing goes from here on where they are many: what is near may be smooth, without any seed point.
+        """
         if self.free is None:
             return
         surfels = self.model.surfels().detach()
         before = reaches_before_camera(surfels, *self.free)
-        if bool(before.any()):
+        share = float(before.float().mean())
+        if share > MOST_FREED:
+            self.free = None
+            say(f"{share:.0%} of the Gaussians stand nearer to a camera than the seed points it shows: they are kept.")
+        elif share > 0.0:
             self._edit(Densified.unchanged(surfels).only(~before), keep_statistics=True)
 
     def _free_depths(self) -> tuple[list[Camera], Tensor] | None:

@@ -12,22 +12,23 @@ from torch import Tensor
 from beags_plugin.core.exposure import Exposures, Gains, gains, sightings
 from beags_plugin.export.baking import interpolated
 from beags_plugin.export.color import linear_from_srgb
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.losses.reduction import ordered_linear
 from beags_plugin.plugin.options.schedule import log_linear
-from beags_plugin.plugin.training.base_gains import gains_of_points, point_cloud
 from beags_plugin.plugin.training.prepared_files import bar
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.plugin.views.dataparser import BeagsDataParser
+from beags_plugin.plugin.views.views import View, in_unit_range
 from beags_plugin.system import processes
 from beags_plugin.system.progress import counted, say
 
 LEAST_SPREAD = 0.05  # EV; photos whose gains differ by less are taken to be of one exposure
 CERTAIN = 3.0  # times the noise of a gain, by which the photos' gains must differ to count as different
-RATES = 2e-3, 2e-4  # first and last learning rate of the transforms, log-linear
+RATES = 1e-2, 1e-3  # first and last learning rate of the transforms, log-linear, as 3DGS has them
+BETAS, EPS = (0.9, 0.999), 1e-15  # of Adam
 TOWARDS_START = 0.05  # weight of the squared change of a photo's transform in its step
-POINTS_AFTER = 0.05  # share of the base after which its depth tells which photos show a point
-MOST_VIEWS = 100  # rendered to tell whether photos differ
+OPAQUE = 242  # alpha, of 255, from which a pixel of a photo shows the scene
 GAMMA, OFFSET = 2.4, 0.055
 """sRGB's curve but for the darkest values: (1 + OFFSET) light^(1 / GAMMA) - OFFSET, so that a gain is an affine map."""
 
@@ -35,7 +36,8 @@ GAMMA, OFFSET = 2.4, 0.055
 class PhotoExposures:
     """The transforms of V photos while they are learned; their mean over the photos is the identity throughout.
 
-    Each step moves the transform of its photo by the training loss and by a pull towards where it began.
+    Each step moves the transform of its photo by the training loss and by a pull towards where it began, as Adam does.
+    Every photo has moments and a count of steps of its own, so that how far it moves does not hang on their number.
     """
 
     def __init__(self, model: SceneModel, exposures: Exposures) -> None:
@@ -43,18 +45,19 @@ class PhotoExposures:
         self.affine = exposures.affine.to(model.device).clone().requires_grad_()
         self.start = self.affine.detach().clone()
         self.identity = torch.eye(3, 4).to(self.affine)
-        self.adam = torch.optim.Adam([self.affine], lr=RATES[0], eps=1e-15)
+        self.moments = torch.zeros(2, *self.affine.shape).to(self.affine)  # of first and second order
+        self.steps = torch.zeros(len(self.affine), dtype=torch.long)
         model.exposures = Exposures(exposures.names, self.affine.detach())  # which shares the memory
         self._seen: int | None = None
 
     def state(self) -> dict[str, Any]:
-        """Return where the transforms began, and Adam's moments; see ``Resumable``."""
-        return {"start": self.start.cpu(), "adam": self.adam.state_dict()}
+        """Return where the transforms began, their moments and steps; see ``Resumable``."""
+        return {"start": self.start.cpu(), "moments": self.moments.cpu(), "steps": self.steps.clone()}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on with the moments of ``state``; the model has the transforms."""
-        self.start = state["start"].to(self.start)
-        self.adam.load_state_dict(state["adam"])
+        self.start, self.moments = state["start"].to(self.start), state["moments"].to(self.moments)
+        self.steps = state["steps"].clone()
 
     def __call__(self, colors: Tensor, photo: int) -> Tensor:
         """Return colours [N, 3] as the photo shows them, with a gradient for its transform."""
@@ -63,24 +66,37 @@ class PhotoExposures:
         return ordered_linear(colors, affine[:, :3], affine[:, 3])
 
     def after_step(self, step: int) -> None:
-        """Move the transforms by the gradients of this step."""
+        """Move the transforms of the photos that this step saw by its gradients."""
         gradient = self.affine.grad
         if self._seen is None or gradient is None:
             return
         with torch.no_grad():
             gradient[self._seen] += 2.0 * TOWARDS_START * (self.affine[self._seen] - self.start[self._seen])
+            seen = torch.zeros(len(self.affine))
+            seen[self._seen] = 1.0
+            processes.add_up([seen])
             processes.average([gradient])
-            self.adam.param_groups[0]["lr"] = log_linear(*RATES, self.model.schedule.progress(step))
-            self.adam.step()
+            rate = log_linear(*RATES, self.model.schedule.progress(step))
+            for photo in seen.nonzero()[:, 0].tolist():
+                self.affine[photo] -= rate * self._direction(photo, gradient[photo])
             self.affine -= self.affine.mean(dim=0) - self.identity
         self.affine.grad, self._seen = None, None
+
+    def _direction(self, photo: int, gradient: Tensor) -> Tensor:
+        """Return Adam's step [3, 4] of a photo at rate 1."""
+        self.steps[photo] += 1
+        steps = int(self.steps[photo])
+        first, second = self.moments[0, photo], self.moments[1, photo]
+        first.lerp_(gradient, 1.0 - BETAS[0])
+        second.lerp_(gradient.square(), 1.0 - BETAS[1])
+        return (first / (1.0 - BETAS[0] ** steps)) / ((second / (1.0 - BETAS[1] ** steps)).sqrt() + EPS)
 
 
 def exposures_of_run(model: SceneModel, datamanager: BeagsDataManager) -> PhotoExposures | None:
     """Return the photos' exposures to learn, those of a loaded scene where it has any.
 
-    None where photos have one, and where the base is to show whether they have: see ``asked_of_base``. Those that are
-    wanted where no points tell begin at the identity.
+    None where photos have one exposure, and where no tracks of points tell. Those that are wanted all the same begin at
+    the identity.
     """
     wanted = model.config.exposure
     if wanted == "off":
@@ -95,41 +111,11 @@ def exposures_of_run(model: SceneModel, datamanager: BeagsDataManager) -> PhotoE
     if _of_turning_objects(model, datamanager):
         return None
     if (found := photo_gains(datamanager)) is None:
-        blind = wanted == "on" and point_cloud(datamanager) is None
-        return PhotoExposures(model, Exposures(names, start)) if blind else None
+        return PhotoExposures(model, Exposures(names, start)) if wanted == "on" else None
     learned = wanted == "on" or _differ(found)
     for line in _lines(found, names, learned):
         say(line)
     return _begun(model, names, found) if learned else None
-
-
-def asked_of_base(model: SceneModel, datamanager: BeagsDataManager) -> int | None:
-    """Return the step before which ``exposures_of_base`` is due.
-
-    None where exposures are known or not wanted, and without points, of which the base shows where they are hidden.
-    """
-    if model.config.exposure == "off" or model.exposures is not None or _of_turning_objects(model, datamanager):
-        return None
-    if point_cloud(datamanager) is None or _tell(cast(BeagsDataParser, datamanager.dataparser).tracks("train")):
-        return None
-    return 0 if model.schedule.warm else int(POINTS_AFTER * model.schedule.base_steps)
-
-
-def exposures_of_base(model: SceneModel, datamanager: BeagsDataManager) -> PhotoExposures | None:
-    """Return the photos' exposures to learn, begun at their gains by points [P, 3] that the base shows.
-
-    None where photos have one. It is asked of data that have points alone, see ``asked_of_base``.
-    """
-    views, points = datamanager.views("train"), point_cloud(datamanager)
-    assert points is not None
-    some = np.unique(np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views))).round().astype(int))
-    found = gains_of_points(model, datamanager, points, [views[index] for index in some])
-    if model.config.exposure != "on" and not _differ(found):
-        return None
-    if len(some) < len(views):
-        found = gains_of_points(model, datamanager, points, views)
-    say(_difference(found, ", as the base shows them"))
-    return _begun(model, tuple(view.name for view in views), found)
 
 
 def _begun(model: SceneModel, names: tuple[str, ...], found: Gains) -> PhotoExposures:
@@ -146,26 +132,33 @@ def _of_turning_objects(model: SceneModel, datamanager: BeagsDataManager) -> boo
     return model.config.exposure == "auto" and datamanager.config.photos == "objects"
 
 
-def _tell(tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> bool:
-    """Return whether tracks say of any point which photos show it."""
-    return any((ids >= 0).any() for ids, _ in tracks)
-
-
 def photo_gains(datamanager: BeagsDataManager) -> Gains | None:
-    """Return how bright the training photos show the points of the COLMAP model; None without one."""
+    """Return how bright the training photos show the points that tracks say they share; None without any."""
     tracks = cast(BeagsDataParser, datamanager.dataparser).tracks("train")
-    if not _tell(tracks):
+    if not any((ids >= 0).any() for ids, _ in tracks):
         return None
     places, light = [], []
     with bar("Comparing exposures", passing=True) as progress:
         for index, view in enumerate(counted(datamanager.views("train"), len(tracks), progress)):
-            image = view.image.cpu()
+            held = view.data()
+            image = in_unit_range(held["image"]).cpu()
             ids, shares = tracks[index]
             xy = datamanager.straightened(shares, index, "train")[1]
             inside = ((xy >= 0) & (xy < image.shape[1::-1])).all(axis=1)  # Without its lens a photo shows less.
+            inside[inside] = _shown(view, held, datamanager)[tuple(xy[inside].astype(np.int64).T[::-1])]
             places.append(np.where(inside, ids, -1))
             light.append(linear_from_srgb(interpolated(image, xy)))
     return gains(sightings(places, light), len(tracks))
+
+
+def _shown(view: View, held: dict[str, Tensor], datamanager: BeagsDataManager) -> np.ndarray:
+    """Return [H, W] bool, where a photo whose data are ``held`` shows what training sees."""
+    shown = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool)
+    if (alpha := held.get("alpha")) is not None:
+        shown &= alpha.cpu() >= OPAQUE
+    if datamanager.config.photos == "objects" and (labels := view.labels) is not None:
+        shown &= ((labels != BACKGROUND) & (labels != IGNORE)).cpu()
+    return shown.numpy()
 
 
 def _differ(found: Gains) -> bool:
@@ -187,14 +180,14 @@ def _lines(found: Gains, names: Sequence[str], learned: bool) -> Iterator[str]:
         )
 
 
-def _difference(found: Gains, source: str = "") -> str:
-    """Return the sentence about photos that get transforms. source: of these gains, a clause."""
+def _difference(found: Gains) -> str:
+    """Return the sentence about photos that get transforms."""
     means = found.stops.mean(axis=1)
     tinted = found.spread_of_colors
     balance = f", and their colours by {tinted:.2f} EV besides" if tinted > LEAST_SPREAD else ""
     return (
         f"The photos differ in exposure by {found.spread:.2f} EV (standard deviation; {means.min():+.2f} to "
-        f"{means.max():+.2f}){balance}{source}: each gets a colour transform of its own, and the scene has the mean "
+        f"{means.max():+.2f}){balance}: each gets a colour transform of its own, and the scene has the mean "
         "photo's exposure."
     )
 

@@ -7,6 +7,7 @@ import shutil
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,15 +29,16 @@ from resumed_runs import (
 from beags_plugin.core.color_fit import apply_affine
 from beags_plugin.core.exposure import Exposures
 from beags_plugin.export.color import srgb_from_linear
+from beags_plugin.export.frames import Frame
 from beags_plugin.plugin.objects.evaluate import evaluate_run
 from beags_plugin.plugin.objects.extract import extract_objects
-from beags_plugin.plugin.objects.photos import _image
+from beags_plugin.plugin.objects.photos import _image, photos_of
 from beags_plugin.plugin.objects.shown import shown_scene
 from beags_plugin.plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.presets import preset_config
 from beags_plugin.plugin.runs.picked import write_picked
 from beags_plugin.plugin.runs.read import read_run
-from beags_plugin.plugin.training.exposure import GAMMA, PhotoExposures, exposures_of_run, photo_gains
+from beags_plugin.plugin.training.exposure import GAMMA, RATES, PhotoExposures, exposures_of_run, photo_gains
 from beags_plugin.plugin.views.datamanager import BeagsDataManager, BeagsDataManagerConfig
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.sample.exposure import photo_gains as true_gains
@@ -65,8 +67,8 @@ def whole(shared, folder):
     return shared("exposed_run", lambda at: run_to_end(short_config(folder(**EXPOSED), at / "run"))) / "run"
 
 
-def manager_of(data: Path) -> BeagsDataManager:
-    config = BeagsDataManagerConfig(dataparser=BeagsDataParserConfig(data=data))
+def manager_of(data: Path, **options) -> BeagsDataManager:
+    config = BeagsDataManagerConfig(dataparser=BeagsDataParserConfig(data=data), **options)
     return BeagsDataManager(config, device="cpu", test_mode="val")
 
 
@@ -206,11 +208,56 @@ def test_a_photo_is_pulled_towards_where_it_began():
     own = PhotoExposures(model, Exposures(("a", "b"), torch.eye(3, 4).repeat(2, 1, 1)))
     with torch.no_grad():
         own.affine[0, 0, 3], own.affine[1, 0, 3] = 0.1, -0.1
-    for step in range(50):
+    for step in range(8):
         (0.0 * own(torch.ones(2, 3), 0)).sum().backward()
         own.after_step(step)
     assert 0.0 < float(own.affine[0, 0, 3]) < 0.08
     assert model.exposures is not None and torch.equal(model.exposures.affine, own.affine.detach())
+
+
+@pytest.mark.parametrize("count", [2, 200])
+def test_how_far_a_photo_moves_does_not_hang_on_the_number_of_photos(count):
+    own = PhotoExposures(Model(), Exposures(tuple(map(str, range(count))), torch.eye(3, 4).repeat(count, 1, 1)))
+    for step in range(2 * count):  # It is seen twice.
+        own(torch.full((2, 3), 0.5), step % count).sum().backward()
+        own.after_step(step)
+        if step == count - 1:
+            once = own.steps.clone()
+    assert (once == 1).all() and (own.steps == 2).all()
+    before, moments = own.affine.detach().clone(), own.moments.clone()
+    own(torch.full((2, 3), 0.5), 0).sum().backward()
+    own.after_step(0)
+    moved = own.affine.detach() - before
+    assert torch.allclose(moved[0] - moved[1], torch.full((3, 4), -RATES[0]), rtol=1e-3)
+    assert torch.equal(own.moments[:, 1:], moments[:, 1:])
+
+
+@pytest.mark.parametrize("photos", ["all", "objects"])
+def test_photos_without_tracks_get_transforms_only_where_they_are_wanted(folder, tmp_path, photos, capsys):
+    data = shutil.copytree(folder(**EXPOSED), tmp_path / "data")
+    (data / "seed_tracks.json").unlink()
+    manager = manager_of(data, photos=photos)
+    capsys.readouterr()
+    assert photo_gains(manager) is None and exposures_of_run(Model(), manager) is None
+    own = exposures_of_run(Model("on"), manager)
+    assert own is not None and torch.equal(own.affine, torch.eye(3, 4).repeat(10, 1, 1))
+    assert capsys.readouterr().out == ""
+
+
+def test_objects_that_turn_in_a_standing_light_are_no_exposures(folder):
+    manager = manager_of(folder(**EXPOSED), photos="objects")
+    assert exposures_of_run(Model(), manager) is None
+    inside, every = photo_gains(manager), photo_gains(manager_of(folder(**EXPOSED)))
+    assert (inside.noise > every.noise).all(), "points on the background tell nothing"
+    assert exposures_of_run(Model("on"), manager) is not None
+
+
+def test_what_is_see_through_tells_no_exposure(folder, monkeypatch):
+    manager = manager_of(folder(**EXPOSED))
+    cached = manager.cached_train[2]
+    cached["alpha"] = torch.zeros(cached["image"].shape[:2], dtype=torch.uint8)
+    found = photo_gains(manager)
+    assert np.isinf(found.noise[2]) and np.isfinite(np.delete(found.noise, 2)).all()
 
 
 def test_colours_are_those_that_the_photo_shows():
@@ -229,7 +276,7 @@ def test_a_killed_run_ends_as_the_whole_one(folder, whole, tmp_path, monkeypatch
     resume_to_end(run)
     assert_same_run(run, whole)
     part = checkpoint_of(run)["beags"]["parts"]["exposure"]
-    assert part["adam"]["state"][0]["exp_avg"].any() and float(part["adam"]["state"][0]["step"]) == 57
+    assert part["moments"].flatten(2).any(dim=2).all() and int(part["steps"].sum()) == 57
 
 
 def test_curves_and_evaluation_take_the_fit_for_exposures(whole, short_run):
@@ -279,6 +326,22 @@ def test_textures_and_exports_get_photos_of_the_mean_exposure(whole):
         inside = ((evened > 0) & (evened < 1)).all(dim=-1)
         assert inside.float().mean() > 0.5 and (photo - evened).abs().max() > 0.01
         assert torch.allclose(apply_affine(evened, affine)[inside], photo[inside], atol=1e-4)
+
+
+def test_burnt_out_pixels_are_no_colours_of_a_surface(whole):
+    """Evened, the white of a bright photo would be a grey that no surface has."""
+    scene = read_run(whole / "config.yml")
+    shown = shown_scene(scene, whole / "config.yml")
+    images = [view.image.clone() for view in shown.photos]
+    images[2][5:9, 3:6] = 1.0
+    burnt = [(image == 1.0).all(dim=2) for image in images]
+    assert burnt[2].sum() >= 12
+    for exposures in (shown.exposures, None):
+        scene = replace(shown, exposures=exposures)
+        vars(scene)["photos"] = [SimpleNamespace(image=image) for image in images]  # which are read only once
+        for view, photo in enumerate(photos_of(scene, None, Frame.of_run())):
+            expected = ~burnt[view] if exposures is not None else torch.ones_like(burnt[view])
+            assert torch.equal(photo.own(), expected)
 
 
 def refined(data: Path, run: Path, base: Path, **options) -> Path:

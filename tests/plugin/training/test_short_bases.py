@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("nerfstudio")
 
@@ -88,11 +89,36 @@ def test_what_stands_before_a_camera_goes_while_the_base_trains(tmp_path, monkey
         counts.append((before, len(own.model.gauss_params["means"])))
 
     monkeypatch.setattr(densifier.Densifier, "_free_cameras", moved)
+    monkeypatch.setattr(densifier, "MOST_FREED", 1.0)
     options = {"pipeline.model.densify.free_share": 0.7, "pipeline.model.densify.every": 15,
                "pipeline.model.densify.stop": stop, "pipeline.model.densify.start": 10,
                "pipeline.model.refine_steps": 0}  # fmt: skip
     run_to_end(usual_config(data, tmp_path / "run", **options))
     assert counts and all(after <= before - len(range(0, before, 4)) for before, after in counts)
+
+
+def test_many_gaussians_before_cameras_are_a_scene_whose_seed_points_lack_what_is_near(tmp_path, monkeypatch, capsys):
+    data = write_scene(tmp_path / "data")
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3)).astype("<f4")
+    with open(data / "points.ply", "wb") as file:
+        write_vertices(file, points.view([(name, "<f4") for name in "xyz"])[:, 0])
+    content = json.loads((data / "transforms.json").read_text())
+    (data / "transforms.json").write_text(json.dumps(content | {"ply_file_path": "points.ply"}))
+    asked = []
+
+    def many(surfels, cameras, depths):
+        asked.append(len(surfels))
+        return torch.arange(len(surfels)) % 4 == 0
+
+    monkeypatch.setattr(densifier, "reaches_before_camera", many)
+    options = {"pipeline.model.densify.every": 15, "pipeline.model.densify.start": 10,
+               "pipeline.model.densify.stop": 11}  # fmt: skip
+    capsys.readouterr()
+    run_to_end(usual_config(data, tmp_path / "kept", **options, **{"pipeline.model.densify.free_share": 0.7}))
+    assert "25% of the Gaussians stand nearer to a camera than the seed points it shows" in capsys.readouterr().out
+    run_to_end(usual_config(data, tmp_path / "never", **options, **{"pipeline.model.densify.free_share": 0.0}))
+    assert len(asked) == 1
+    assert_same_run(tmp_path / "kept", tmp_path / "never")
 
 
 def test_nothing_is_known_of_the_space_before_cameras_where_seed_points_were_generated(data, tmp_path, monkeypatch):
