@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -189,8 +190,24 @@ def test_the_command_plans_and_writes_nothing(tmp_path, capsys):
     cli.main(["bench", "captures", *arguments, "--output", str(tmp_path / "out")])
     text = printed(capsys)
     assert "kitchen is left out: " in text and "8 trials, 8 of them not done." in text
-    assert "v03.png is of no held-out photo, so it is not scored." in text
+    assert "v03.png is of no held-out photo and not scored." in text
     assert "no silhouette of banana lies in" in text and not (tmp_path / "out").exists()
+
+
+def test_truth_of_another_scene_is_told_before_anything_is_trained(tmp_path, capsys):
+    write_capture(tmp_path / "data", "fruit")
+    write_truth(tmp_path / "truth", "fruit", ("v00", "v08"))
+    for file in list((tmp_path / "truth").rglob("*.png")):
+        file.rename(file.with_stem(f"other-{file.stem}"))
+    options = CapturesOptions(tmp_path / "data", tmp_path / "truth", scenes=("fruit",), plan=True)
+    run_captures(options)
+    lines = [line for line in printed(capsys).splitlines() if "another scene" in line]
+    assert " ".join(lines).count("no file in") == 2, "a sentence for each object, none for each file"
+    shutil.rmtree(tmp_path / "truth")
+    write_truth(tmp_path / "truth", "fruit", ("v00",))
+    Image.new("L", (10, 90)).save(tmp_path / "truth/fruit/apple/v00.png")
+    with pytest.raises(UserError, match="apple/v00.png is 10 x 90 pixels, which are other proportions than those of"):
+        run_captures(options)
 
 
 @pytest.mark.parametrize(

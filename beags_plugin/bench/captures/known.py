@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from beags_plugin.bench.captures.options import CapturesOptions
 from beags_plugin.bench.scenes import SceneSize, TrialScene
-from beags_plugin.data.files import image_size, list_images
+from beags_plugin.data.files import image_size, list_images, same_proportions
 from beags_plugin.system.digests import folder_digest
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.shipped import shipped_folder
@@ -120,22 +120,36 @@ def _found(capture: Capture, folder: Path, options: CapturesOptions) -> tuple[Fo
     if not capture.objects or options.truth is None:
         return FoundCapture(capture, photos, size, None), []
     truth = options.truth / capture.name
-    notes = _truth_notes(capture, truth, {image.stem for image in held_out.image_filenames})
+    notes = _truth_notes(capture, truth, {image.stem: image for image in held_out.image_filenames})
     return FoundCapture(capture, photos, size, truth.resolve() if truth.is_dir() else None), notes
 
 
-def _truth_notes(capture: Capture, truth: Path, held_out: set[str]) -> list[str]:
-    """Return a sentence for each object without a silhouette, and for each file that no held-out photo belongs to."""
+def _truth_notes(capture: Capture, truth: Path, held_out: Mapping[str, Path]) -> list[str]:
+    """Return sentences about silhouettes that are missing, or of no held-out photo. held_out: photos by their stems.
+
+    Raises ``UserError`` for a silhouette with other proportions than its photo.
+    """
     notes = []
     for name in capture.objects:
         files = list_images(truth / name)
+        others = [file for file in files if file.stem not in held_out]
         if not files:
             notes.append(f"{capture.name}: no silhouette of {name} lies in {truth / name}, so it is not scored.")
-        notes += [
-            f"{capture.name}: {file} is of no held-out photo, so it is not scored."
-            for file in files
-            if file.stem not in held_out
-        ]
+        elif len(others) == len(files):
+            notes.append(
+                f"{capture.name}: no file in {truth / name} is named as a held-out photo, so {name} is not scored: "
+                "these silhouettes may be of another scene."
+            )
+        elif others:
+            more = f" and {len(others) - 1} more are" if len(others) > 1 else " is"
+            notes.append(f"{capture.name}: {others[0]}{more} of no held-out photo and not scored.")
+        for file in files:
+            photo = held_out.get(file.stem)
+            if photo is not None and not same_proportions(image_size(photo), size := image_size(file)):
+                raise UserError(
+                    f"the silhouette {file} is {size[0]} x {size[1]} pixels, which are other proportions than those of "
+                    f"{photo}: trace it in that photo, or take it away."
+                )
     return notes
 
 
