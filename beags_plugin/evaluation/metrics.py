@@ -23,14 +23,15 @@ class MaskMetrics:
     """Agreement of one predicted mask with its truth, or a mean of it.
 
     acc: pixel accuracy. iou: intersection over union. biou: IoU of the inner boundary bands. Each is in 0..1, higher is
-    better. spill: see ``spill``; 0 or more, lower is better. None: nothing to compare, as where both masks are empty;
-    it is left out of means.
+    better. spill: see ``spill``; 0 or more, lower is better. covered: see ``covered``, of the whole scene; 0..1, lower
+    is better. None: nothing to compare, as where both masks are empty; it is left out of means.
     """
 
     acc: float | None
     iou: float | None
     biou: float | None
     spill: float | None = None
+    covered: float | None = None
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,16 @@ def spill(predicted: np.ndarray, true: np.ndarray, counted: np.ndarray, margin: 
     distance = cv2.distanceTransform((~true).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     squared = np.rint(np.square(distance, dtype=np.float64))  # whole numbers, but for OpenCV's rounding of the root
     return np.count_nonzero(predicted & counted & (squared > margin**2)) / area
+
+
+def covered(prediction: Any, truth: Any, ignore: Any = None, protocol: Protocol | None = None) -> float | None:
+    """Return the share of the truth's pixels that a mask lacks, as where fog stands before an object.
+
+    None without a pixel of truth that counts; else as ``mask_metrics``.
+    """
+    predicted, true, counted = compared_masks(prediction, truth, ignore, protocol)
+    area = np.count_nonzero(true & counted)
+    return np.count_nonzero(true & counted & ~predicted) / area if area else None
 
 
 def psnr(a: Any, b: Any) -> float:

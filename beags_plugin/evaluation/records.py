@@ -19,11 +19,11 @@ Kind = MaskKind | Literal["removal"]
 FIGURES: dict[Kind, tuple[str, ...]] = {
     "extracted": METRICS,
     "seen": METRICS,
-    "rendered": AGREEMENT,
+    "rendered": (*AGREEMENT, "covered"),
     "removal": REMOVAL_METRICS,
 }
-"""The names of the figures of each kind. Spill is of objects drawn alone. removal: the scene rendered without the
-object, where the data has an exact picture of that."""
+"""The names of the figures of each kind. Spill is of objects drawn alone, covered of the whole scene. removal: the
+scene rendered without the object, where the data has an exact picture of that."""
 KINDS = tuple(FIGURES)
 IMAGE_FIGURES = ("psnr", "psnr_fit", "psnr_shown", "shown", "psnr_objects", "ssim")
 """Of whole images. psnr_fit: after the affine map of colours that fits the photo best, one a photo, clamped to 0..1.

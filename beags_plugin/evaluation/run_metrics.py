@@ -13,10 +13,9 @@ from torch import Tensor
 from beags_plugin.core.color_fit import affine_color_fit, apply_affine
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.evaluation.metrics import mask_metrics, mean, mean_metrics, psnr
+from beags_plugin.evaluation.metrics import covered, mask_metrics, mean, mean_metrics, psnr
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import (
-    FIGURES,
     IMAGE_FIGURES,
     KINDS,
     MASK_KINDS,
@@ -78,8 +77,9 @@ def evaluate_scene(
             for kind in MASK_KINDS if complete else ("extracted", "seen"):
                 for class_id, mask in renderer.masks(kind, objects).items():
                     metrics = mask_metrics(mask.prediction, mask.truth, mask.ignore, protocol)
-                    if "spill" not in FIGURES[kind]:
-                        metrics = replace(metrics, spill=None)
+                    if kind == "rendered":
+                        hidden = covered(mask.prediction, mask.truth, mask.ignore, protocol)
+                        metrics = replace(metrics, spill=None, covered=hidden)
                     masks.append(MaskRecord(kind, class_id, index, mask.source, metrics))
             image = ViewRecord(view.name, None, None)
             if complete and view.image is not None:

@@ -158,7 +158,8 @@ def _meaning(stages: Sequence[Stage]) -> str:
 
 def _mask_table(what: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> RenderableType:
     """Return rows of all kinds of mask metrics per stage, with PSNR and SSIM if any row has images."""
-    columns = [(kind, metric) for kind in MASK_KINDS for metric in FIGURES[kind]]
+    # What is covered stands in files alone: one column more is too many for a terminal.
+    columns = [(kind, metric) for kind in MASK_KINDS for metric in FIGURES[kind] if metric != "covered"]
     columns = [c for c in columns if c[0] != "seen" or (c[1] in ("iou", "biou") and _known(rows, stages, *c))]
     return _table(f"{what}: masks, %{_meaning(stages)}", first, rows, stages, columns)
 

@@ -38,8 +38,8 @@ from beags_plugin.system.errors import UserError
 
 STRAY = (20.0, 20.0, 2.0)
 IDS = torch.tensor([1, 2, 0], dtype=torch.int32)  # cup, box, floor
-RENDERED = MaskMetrics(1.0, 1.0, 1.0)
-PERFECT = ObjectMetrics(replace(RENDERED, spill=0.0), RENDERED)
+RENDERED = MaskMetrics(1.0, 1.0, 1.0, covered=0.0)
+PERFECT = ObjectMetrics(replace(RENDERED, spill=0.0, covered=None), RENDERED)
 
 
 def evaluated(squares, ids, *views: EvalView, **options) -> SceneMetrics:
@@ -159,7 +159,9 @@ SECONDS = {"base": 12.345}
 
 def report(classes: dict[int, str] | None = None) -> RunMetrics:
     def stage(value: float, psnr: float) -> SceneMetrics:
-        one = ObjectMetrics(MaskMetrics(value, value - 0.1, value - 0.2, 1 - value), MaskMetrics(value, value, value))
+        one = ObjectMetrics(
+            MaskMetrics(value, value - 0.1, value - 0.2, 1 - value), MaskMetrics(value, value, value, covered=1 - value)
+        )
         return SceneMetrics(one, {1: one, 2: ObjectMetrics(None, None)}, psnr, "silhouette")
 
     return RunMetrics("lab", "config.yml", Protocol(), classes or CLASSES, stage(0.8, 30.0), stage(0.9, math.inf))
@@ -172,7 +174,7 @@ def test_the_summary_has_the_documented_keys():
     for row in (summary["mean"], summary["objects"]["cup"]):
         assert set(row) == {"extracted", "seen", "rendered", "removal"}
         assert row["extracted"]["assigned"] == pytest.approx({"acc": 0.8, "iou": 0.7, "biou": 0.6, "spill": 0.2})
-        assert row["rendered"]["refined"] == pytest.approx({"acc": 0.9, "iou": 0.9, "biou": 0.9})
+        assert row["rendered"]["refined"] == pytest.approx({"acc": 0.9, "iou": 0.9, "biou": 0.9, "covered": 0.1})
     assert summary["objects"]["box"]["extracted"]["refined"] == dict.fromkeys(METRICS)
     assert summary["psnr"] == {"before": 30.0, "after": None}  # infinity is no JSON
     assert summary["seconds"] == {"base": 12.345} and summary["peak_memory_mb"] == 812.0

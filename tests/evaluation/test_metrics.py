@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from beags_plugin.evaluation.metrics import MaskMetrics, band_width, boundary_band, mask_metrics, psnr, spill
+from beags_plugin.evaluation.metrics import MaskMetrics, band_width, boundary_band, covered, mask_metrics, psnr, spill
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.labels.class_ids import resize_nearest
 
@@ -54,6 +54,14 @@ def test_ignored_pixels_leave_every_count():
     assert mask_metrics(predicted, truth, ignore) == MaskMetrics(1.0, 1.0, 1.0, 0.0)
     assert mask_metrics(predicted, truth).iou == 4 / 6
     assert mask_metrics(predicted, truth).spill == 1 / 4  # the far corner; the pixel beside the mask is within d = 1
+
+
+def test_covered_is_what_a_mask_lacks():
+    truth, predicted = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
+    truth[:2], predicted[1:] = True, True
+    assert covered(predicted, truth) == 0.5 and covered(~truth, truth) == 1.0
+    assert covered(predicted, truth, ignore=~predicted) == 0.0
+    assert covered(predicted, ~truth & False) is None
 
 
 @pytest.mark.parametrize("seed", range(4))

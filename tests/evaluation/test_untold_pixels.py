@@ -46,7 +46,7 @@ def test_what_is_drawn_there_changes_no_figure(kind):
     untold = [(x - HALF, y, half) for x, y, half in QUARTERS]
     for squares in (QUARTERS, [*QUARTERS, untold[0]], [*QUARTERS, *untold]):
         cup = getattr(evaluated(views()[kind], squares, [1] * len(squares)).objects[1], kind)
-        assert cup == MaskMetrics(1.0, 1.0, 1.0, None if kind == "rendered" else 0.0)
+        assert cup == MaskMetrics(1.0, 1.0, 1.0, *((None, 0.0) if kind == "rendered" else (0.0, None)))
     told = replace(views()[kind], unknown_silhouettes=None, unknown_visible=None)
     if kind != "seen":
         assert getattr(evaluated(told, [CUP], [1]).objects[1], kind).iou == pytest.approx(0.5)
