@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal, cast
 
-from nerfstudio.pipelines.base_pipeline import VanillaPipeline
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
+from beags_plugin.plugin.options.model_options import BeagsModelConfig
+from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
 from beags_plugin.system.errors import print_user_errors_plainly
 
 
@@ -16,6 +18,17 @@ class BeagsPipeline(VanillaPipeline):
     ``training.replicas`` does the rest.
     """
 
-    def __init__(self, *args: Any, world_size: int = 1, local_rank: int = 0, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        config: VanillaPipelineConfig,
+        device: str,
+        test_mode: Literal["test", "val", "inference"] = "val",
+        world_size: int = 1,
+        local_rank: int = 0,
+        **others: Any,
+    ) -> None:
         print_user_errors_plainly()
-        super().__init__(*args, world_size=1, local_rank=local_rank, **kwargs)
+        model = cast(BeagsModelConfig, config.model)
+        data = cast(BeagsDataManagerConfig, config.datamanager)
+        data.begins = test_mode == "val" and model.base_steps > 0 and model.start_from is None
+        super().__init__(config, device, test_mode, world_size=1, local_rank=local_rank, **others)

@@ -28,6 +28,7 @@ from beags_plugin.plugin.views import lens
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio, resize_cameras
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig, absolute
 from beags_plugin.plugin.views.dataset import BeagsDataset
+from beags_plugin.plugin.views.dense_seeds import MOST_PHOTOS, with_dense_seeds
 from beags_plugin.plugin.views.objects_alone import objects_alone
 from beags_plugin.plugin.views.small_views import SizeAt, SmallViews
 from beags_plugin.plugin.views.streaming import Lazy, StreamedViews
@@ -52,6 +53,10 @@ class BeagsDataManagerConfig(FullImageDatamanagerConfig):
     those of a split would take more than stream_above_gb."""
     stream_above_gb: Suppress[float] = 0.5
     """GB (10^9 bytes) that the images of a split may take in memory before they are streamed."""
+    dense_seeds: Literal["auto", "on", "off"] = "auto"
+    """Whether a base begins with more seed points, on whose depth several photos agree; auto: where there are at most
+    50 photos, of which features give few points. It takes one or two seconds a photo."""
+    begins: Suppress[bool] = False  # whether a base is to begin with seed points, which the pipeline says
     photos: Literal["all", "objects"] = "all"
     """What training sees of the photos: all, or objects, their pixels alone before a random colour (turntables)."""
 
@@ -85,6 +90,15 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         self._present: list[list[int]] | None = None  # objects of each training view's labels, once they are replaced
         # nerfstudio samples evaluation views by Python's global generator, which others use too.
         self._eval_order = random.Random(config.train_cameras_sampling_seed)
+        self._add_dense_seeds()
+
+    def _add_dense_seeds(self) -> None:
+        """Add seed points that photos agree on, where they are wanted; there are none without points to begin with."""
+        seeds, wanted = self.train_dataparser_outputs.metadata, self.config.dense_seeds
+        few = len(self.train_dataset) <= MOST_PHOTOS and self.config.photos == "all"
+        if self.config.begins and not seeds["points3D_random"] and (wanted == "on" or (wanted == "auto" and few)):
+            found = with_dense_seeds(self.views("train"), seeds["points3D_xyz"], seeds["points3D_rgb"])
+            seeds["points3D_xyz"], seeds["points3D_rgb"] = found
 
     def _load_images(self, split: Split, cache_images_device: Literal["cpu", "gpu"]) -> Any:
         """Return the data of all views, in memory or streamed."""
