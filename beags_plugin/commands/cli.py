@@ -104,6 +104,9 @@ class Sample:
     """The largest difference of a photo's red from the mean, and of its blue the other way, in stops, at most 6."""
     moved: int = 0
     """Views to train on that show something of the background which stands elsewhere in each, and in no other view."""
+    shared_damage: float = 0.0
+    """Share of the masks to train on, 0 to 1, in which half of the objects take in what they stand on, or lack a foot,
+    alike in all of them."""
 
     def run(self) -> None:
         with starting(self):
@@ -111,6 +114,7 @@ class Sample:
         make_sample(
             self.output, self.seed, self.width, self.height, self.degradation, self.views, family=self.family,
             exposure=self.exposure, white_balance=self.white_balance, moved=self.moved,
+            shared_damage=self.shared_damage,
         )  # fmt: skip
         CONSOLE.print(f"sample: {self.output}", markup=False)
 

@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from beags_plugin.sample.scene import Scene
 from beags_plugin.sample.tracing import first_hits
-from beags_plugin.sample.views import Picture, View
+from beags_plugin.sample.views import Picture, View, pixel_directions
 
 MIN_VIEWS = 6  # photos that must show a patch of surface; fewer, through a gap and at a slant, do not place it in space
 PATCH = 0.03  # side of a patch, world units: a few pixels, so that every photo that shows one has points in it
@@ -24,11 +24,14 @@ NEAR = 0.05  # share of a point's depth by which that of its pixel in a photo ma
 SAME = 1e-6  # share of the distance to a point by which rounding lets a ray end before it
 
 
+def surface_points(view: View, depth: np.ndarray) -> np.ndarray:
+    """Return the world points [H W, 3] that the pixel centres of ``view`` show; depth: [H, W], along the axis."""
+    return view.center + depth.reshape(-1, 1) * pixel_directions(view)
+
+
 def visible_surface(view: View, picture: Picture) -> list[np.ndarray]:
     """Return world points [P, 3] of each object's surface that ``view`` shows, one per pixel."""
-    rows, columns = np.indices(picture.labels.shape)
-    directions = view.directions(columns.ravel() + 0.5, rows.ravel() + 0.5)
-    points = view.center + picture.depth.reshape(-1, 1) * directions
+    points = surface_points(view, picture.depth)
     labels = picture.labels.ravel()
     return [points[labels == class_id] for class_id in range(1, len(picture.silhouettes) + 1)]
 

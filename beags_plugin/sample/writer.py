@@ -18,13 +18,14 @@ from beags_plugin.sample.exposure import LARGEST_STOPS
 from beags_plugin.sample.families import FAMILIES
 from beags_plugin.sample.points import SeedPoints, find_tracks, seed_points
 from beags_plugin.sample.seen import Photo, seen_part, shown_points, visible_surface, well_seen
+from beags_plugin.sample.shared_damage import flawed_mask, plan_flaws
 from beags_plugin.sample.shots import Shot, plan_shots
 from beags_plugin.sample.views import Picture, View, render_pixels, render_removed, render_view, surface_without
 from beags_plugin.system.errors import UserError, check_choice, unwritable, writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.reading.ply import write_vertices
 
-VERSION = 11
+VERSION = 12
 """Raise it whenever the same config would give other files: older samples are then rebuilt."""
 LARGEST_SIDE = 8192  # pixels
 POINT_NOISE = 0.03
@@ -46,6 +47,8 @@ class SampleConfig:
         for both all photos are alike.
     moved: training photos in which something of the background stands before the camera, elsewhere in each; no other
         photo shows it.
+    shared_damage: share of the training masks in which each of half of the objects takes in what it stands on, or lacks
+        its foot on one side, alike in all of them (``plan_flaws``); ``degradation`` comes after it.
     """
 
     seed: int = 0
@@ -60,6 +63,7 @@ class SampleConfig:
     exposure: float = 0.0
     white_balance: float = 0.0
     moved: int = 0
+    shared_damage: float = 0.0
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that makes no scene."""
@@ -81,6 +85,8 @@ class SampleConfig:
             raise UserError(
                 f"the sample's moved is {self.moved}: give at most {self.num_train}, the number of training photos."
             )
+        if not 0.0 <= self.shared_damage <= 1.0:
+            raise UserError(f"the sample's shared_damage is {self.shared_damage}: give a share of views from 0 to 1.")
         check_choice(self.family, FAMILIES, "family of scenes")
         resolve_degradation(self.degradation)
 
@@ -91,15 +97,10 @@ class SampleConfig:
 
 def is_sample(folder: Path, config: SampleConfig) -> bool:
     """Return whether ``folder`` holds the complete sample of this very config."""
-    return _read_config(folder) == config.as_dict()
-
-
-def _read_config(folder: Path) -> Any:
-    """Read sample.json; None if there is none or it is damaged."""
     try:
-        return json.loads((folder / SAMPLE_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
+        return json.loads((folder / SAMPLE_FILE).read_text(encoding="utf-8")) == config.as_dict()
+    except (OSError, ValueError):  # sample.json is missing or damaged
+        return False
 
 
 def write_sample(
@@ -161,6 +162,7 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
     shots = plan_shots(family, config.seed, views, config.exposure, config.white_balance, config.moved)
     degradation = resolve_degradation(config.degradation)
     train = [view.name for view in views if view.split == "train"]
+    flaws = plan_flaws(shots[0].still, train, config.seed, config.shared_damage)
     dropped = dropped_views(train, config.seed, degradation.dropped)
     ends = [config.num_points * i // len(train) for i in range(len(train) + 1)]
     shares = {name: end - first for name, first, end in zip(train, ends[:-1], ends[1:], strict=True)}
@@ -187,6 +189,7 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
             photos.append(Photo(view, scene, picture.depth))
             for surface, part in zip(surfaces, visible_surface(view, picture), strict=True):
                 surface.append(part)
+            mask = flawed_mask(mask, picture.depth, view, flaws)
             mask = degrade_mask(mask, len(names), degradation, config.seed, view.name)
             # One generator per view, so that no view's points depend on another's picture.
             generator = np.random.default_rng([config.seed, 6, done])

@@ -1,0 +1,117 @@
+"""Mask damage that most views share, as segmenters make it: a plinth taken in, a foot left out.
+
+Each flaw is a region of space that stands with its object, so that views agree on it. Seed and names decide everything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
+
+from beags_plugin.sample.lots import lowest_lots
+from beags_plugin.sample.scene import Scene, Thing
+from beags_plugin.sample.seen import surface_points
+from beags_plugin.sample.solids import dot, turned
+from beags_plugin.sample.views import View
+
+CHORDS = 4096  # rays that sample the surface of an object
+FOOT = 0.15  # share of an object's height that its foot has
+TAKEN_IN = 0.25, 0.40
+"""How far what is taken in reaches beyond the foot: a share of half of the object's width or height, the larger one."""
+LEFT_OUT = 0.06, 0.14
+"""Share of an object's surface that is left out."""
+
+
+@dataclass(frozen=True)
+class Near:
+    """The region within ``radius`` of some of ``points`` [F, 3], world."""
+
+    points: np.ndarray
+    radius: float
+
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """Return [P] bool: which world points [P, 3] lie in the region."""
+        return np.isfinite(cKDTree(self.points).query(points, distance_upper_bound=self.radius)[0])
+
+
+@dataclass(frozen=True)
+class Beyond:
+    """The half-space of points that lie farther along ``way`` [3] than ``limit``."""
+
+    way: np.ndarray
+    limit: float
+
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """Return [P] bool: which world points [P, 3] lie in the region."""
+        return dot(points, self.way[None]) > self.limit
+
+
+@dataclass(frozen=True)
+class Flaw:
+    """What masks of ``views`` have wrong: surface of the classes ``wrong`` in the region has the id ``instead``."""
+
+    wrong: frozenset[int]
+    instead: int
+    region: Near | Beyond
+    views: set[str]
+
+
+def plan_flaws(scene: Scene, train: Sequence[str], seed: int, share: float) -> list[Flaw]:
+    """Return a flaw of half of the objects, each in the masks of a ``share`` of the training views, if it is above 0.
+
+    The first object, and every second, takes in what it stands on, about its foot; the others lose what lies lowest on
+    one side to the background. Each flaw has views of its own.
+    """
+    count = round(share * len(train))
+    if not count:
+        return []
+    generator = np.random.default_rng([seed, 14])
+    order = 1 + generator.permutation(len(scene.things))
+    flaws = []
+    for i, class_id in enumerate(order[: (len(order) + 1) // 2].tolist()):
+        surface = _surface(scene.things[class_id - 1])
+        angle = generator.uniform(0.0, 2.0 * np.pi)
+        views = lowest_lots(train, seed, count, 14 + class_id)
+        if i % 2 == 0:
+            below = {contact.second for contact in scene.contacts if contact.first == class_id}
+            foot = Near(*_grown_foot(surface, generator.uniform(*TAKEN_IN)))
+            flaws.append(Flaw(frozenset(below | {0}), class_id, foot, views))
+        else:
+            way = np.array([np.cos(angle), np.sin(angle), -1.0]) / np.sqrt(2.0)
+            limit = np.quantile(dot(surface, way[None]), 1.0 - generator.uniform(*LEFT_OUT))
+            flaws.append(Flaw(frozenset({class_id}), 0, Beyond(way, float(limit)), views))
+    return flaws
+
+
+def flawed_mask(labels: np.ndarray, depth: np.ndarray, view: View, flaws: Sequence[Flaw]) -> np.ndarray:
+    """Return ``labels`` [H, W] with the flaws that the view has; depth: [H, W], exact, along the optical axis."""
+    out = labels.copy()
+    for flaw in flaws:
+        if view.name in flaw.views:
+            pixels = np.flatnonzero(np.isin(labels, list(flaw.wrong)))
+            out.ravel()[pixels[flaw.region.holds(surface_points(view, depth)[pixels])]] = flaw.instead
+    return out
+
+
+def _grown_foot(surface: np.ndarray, beyond: float) -> tuple[np.ndarray, float]:
+    """Return the points of a surface [P, 3] that are its foot, and the radius that is ``beyond`` of half its size."""
+    extent = np.ptp(surface, axis=0)
+    return surface[surface[:, 2] <= surface[:, 2].min() + FOOT * extent[2]], float(0.5 * beyond * extent.max())
+
+
+def _surface(thing: Thing[Any]) -> np.ndarray:
+    """Return world points [P, 3] on the outside of an object, where rays from above and from the sides meet it."""
+    generator = np.random.default_rng(0)
+    start, end = generator.normal(size=(2, CHORDS, 3))
+    start, end = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True) for vectors in (start, end))
+    start[:, 2] = np.abs(start[:, 2])
+    # Rays begin on the upper half of a sphere about the object, and pass through the ball that holds it.
+    start, end = 2.0 * start, end * generator.uniform(size=(CHORDS, 1)) ** (1.0 / 3.0)
+    origins, directions = (turned(thing.solid.bound * vectors, thing.rotation) for vectors in (start, end - start))
+    t = thing.solid.first_hit(origins, directions)
+    hit = np.isfinite(t)
+    return turned(origins[hit] + t[hit, None] * directions[hit], thing.rotation.T) + thing.position
