@@ -65,8 +65,8 @@ class PaperFigures:
 class Experiment:
     """The content of ``experiments/<name>.toml``.
 
-    samples, sample: family and seed of the generated scenes, and other options of ``SampleConfig``. seeds: of the
-    training.
+    samples, sample: family and seed of the generated scenes, and other options of ``SampleConfig``. of_seed: such
+    options of the scenes of one seed alone. seeds: of the training.
     reference: the variant that the others' errors are compared with. confidence, front, objects: also plot the masks'
     confidence, the Pareto front, or the largest objects by each variant. relative_to_pixels: sweeps whose axis is also
     given per million training pixels.
@@ -85,6 +85,7 @@ class Experiment:
     objects: bool = False
     relative_to_pixels: frozenset[str] = frozenset()
     paper: PaperFigures | None = None
+    of_seed: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
 
     def header(self) -> dict[str, str]:
         """Return what begins every report: {"experiment", "description", "preset"}."""
@@ -163,11 +164,12 @@ class _Reader:
                 near = meant(named, names)
                 raise self.wrong(f"refers to {named!r}, which is no variant{near}: name one of {', '.join(names)}.")
         sample = dict(self.table(content, "sample", ""))
+        samples, of_seed = self.samples(sample), sample.pop("of_seed", {})
         return Experiment(
             name=self.path.stem,
             description=self.value(content, "description", str),
             preset=self.value(content, "preset", str),
-            samples=self.samples(sample),
+            samples=samples,
             sample=self.checked_sample(sample),
             seeds=self.whole_numbers(content.get("seeds", [42]), "seeds"),
             variants=tuple(variants),
@@ -177,6 +179,7 @@ class _Reader:
             objects=self.value(content, "objects", bool, False),
             relative_to_pixels=frozenset(s["name"] for s in sweeps if s.get("relative_to_pixels")),
             paper=self.paper(),
+            of_seed=self.options_of_seeds(of_seed, sample, {str(seed) for _, seed in samples}),
         )
 
     def variant(self, entry: dict[str, Any], common: dict[str, dict[str, Any]]) -> Variant:
@@ -242,6 +245,13 @@ class _Reader:
                 raise self.wrong(f"sample.seeds is {seeds!r}: choose one of {', '.join(SEEDS)}, or list whole numbers.")
             seeds = list(SEEDS[seeds])
         return tuple((family, seed) for seed in self.whole_numbers(seeds, "sample.seeds") for family in families)
+
+    def options_of_seeds(self, tables: Any, sample: dict[str, Any], seeds: set[str]) -> dict[int, dict[str, Any]]:
+        if not isinstance(tables, dict) or not tables.keys() <= seeds:
+            raise self.wrong(f"sample.of_seed must have tables of the seeds {', '.join(sorted(seeds, key=int))} alone.")
+        for seed in tables:
+            self.checked_sample({**sample, **self.table(tables, seed, "sample.of_seed: ")})
+        return {int(seed): options for seed, options in tables.items()}
 
     def checked_sample(self, options: dict[str, Any]) -> dict[str, Any]:
         from beags_plugin.sample.writer import SampleConfig

@@ -151,7 +151,7 @@ def adapted(experiment: Experiment, options: ExperimentOptions) -> Experiment:
 
     variants = tuple(map(short, _thinned(experiment.variants)))
     sample = {**experiment.sample, **QUICK_SAMPLE}
-    return dataclasses.replace(experiment, variants=variants, sample=sample, samples=experiment.samples[:1])
+    return dataclasses.replace(experiment, variants=variants, sample=sample, samples=experiment.samples[:1], of_seed={})
 
 
 def _thinned(variants: Sequence[Variant]) -> list[Variant]:
@@ -174,7 +174,8 @@ def scenes_of(experiment: Experiment, options: ExperimentOptions) -> list[TrialS
         raise UserError(f"--scenes is {count}, but {experiment.name} names {len(experiment.samples)} sample scenes.")
     folder = options.output / "scenes"
     samples = [
-        sample_scene(folder, *which, experiment.sample, not options.plan) for which in experiment.samples[:count]
+        sample_scene(folder, family, seed, {**experiment.sample, **experiment.of_seed.get(seed, {})}, not options.plan)
+        for family, seed in experiment.samples[:count]
     ]
     if not samples and not given:
         raise UserError("there is no scene to train on: name a folder with --data, or give --scenes 1 or more.")

@@ -6,7 +6,7 @@ import contextlib
 import io
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -119,13 +119,14 @@ def damaged_masks(scene: TrialScene, degree: float, folder: Path, write: bool = 
     """Return a folder with the scene's masks, those of the training views damaged to ``degree`` (1 is mild, 2 strong).
 
     Exact masks (``ground_truth/masks``) are damaged where the scene has them, else its own masks. The scene's seed and
-    the view's name decide the damage. At degree 1 a sample gets its default masks. Masks of held-out views stay as
-    they are. An existing folder of the same damage is used again. Without ``write`` the folder is only named.
+    the view's name decide the damage. At degree 1 a sample gets its default masks: the damage that its views share
+    comes first, where the experiment generates it. Masks of held-out views stay as they are. An existing folder of the
+    same damage is used again. Without ``write`` the folder is only named.
     """
-    from beags_plugin.sample import degrade
+    from beags_plugin.sample import degrade, shared_damage
 
     degradation = degrade.degradation_of_degree(degree)
-    code = [Path(str(file)).read_text("utf8") for file in (degrade.__file__, __file__)]
+    code = [Path(str(file)).read_text("utf8") for file in (degrade.__file__, shared_damage.__file__, __file__)]
     target = folder / f"masks-{value_digest([scene.digest, scene.seed, degree, code])[:12]}"
     if not write or _is_whole(target):
         return target
@@ -134,6 +135,7 @@ def damaged_masks(scene: TrialScene, degree: float, folder: Path, write: bool = 
         splits = {split: parser.get_dataparser_outputs(split) for split in ("test", "train")}
     stems = [Path(file).stem for file in splits["train"].image_filenames]
     dropped = degrade.dropped_views(stems, scene.seed, degradation.dropped)
+    flawed = _shared_damage(scene.sample)
     for split, outputs in splits.items():  # a view in both is for training
         classes = np.array(sorted(outputs.metadata["classes"]))
         masks = _best_masks(outputs.metadata, split)
@@ -142,6 +144,8 @@ def damaged_masks(scene: TrialScene, degree: float, folder: Path, write: bool = 
                 continue
             labels = read_mask(mask, kind, outputs.metadata["ignore_ids"])
             if split == "train":
+                if flawed is not None:
+                    labels = flawed(labels, np.load(scene.data / f"ground_truth/depth/{image.stem}.npy"), image.stem)
                 ranks = np.where(labels == IGNORE, len(classes), np.searchsorted(classes, labels))
                 ranks = degrade.degrade_mask(ranks, len(classes), degradation, scene.seed, image.stem)
                 labels = np.append(classes, IGNORE)[ranks]
@@ -185,6 +189,20 @@ def class_masks(scene: TrialScene, count: int, folder: Path, write: bool = True)
     write_text_atomically(json.dumps({c: f"cell {c}" for c in range(1, count + 1)}), target / "classes.json")
     (target / "complete").touch()
     return target
+
+
+def _shared_damage(config: SampleConfig | None) -> Callable[[np.ndarray, np.ndarray, str], np.ndarray] | None:
+    """Return what gives the exact mask of a training view, from its depth and name, the damage that views share."""
+    if config is None or not config.shared_damage:
+        return None
+    from beags_plugin.sample.families import FAMILIES
+    from beags_plugin.sample.shared_damage import flawed_mask, plan_flaws
+
+    family = FAMILIES[config.family]
+    views = family.views(config.seed, config.width, config.height, config.num_train, config.num_test)
+    train = {view.name: view for view in views if view.split == "train"}
+    flaws = plan_flaws(family.scene(config.seed), list(train), config.seed, config.shared_damage)
+    return lambda labels, depth, name: flawed_mask(labels, depth, train[name], flaws)
 
 
 def _is_whole(target: Path) -> bool:

@@ -74,6 +74,18 @@ def test_mild_damage_is_what_the_sample_has_and_none_is_the_truth(sample, tmp_pa
     assert damaged_masks(sample, 1.0, tmp_path) == mild and (mild / "complete").stat().st_mtime_ns == stamp
 
 
+@pytest.mark.parametrize("family", ["tabletop", "room"])
+def test_masks_of_a_degree_keep_the_damage_that_views_share(family, tmp_path):
+    small = {**SMALL, "shared_damage": 0.75}
+    shared = sample_scene(tmp_path, family, 5, small)
+    assert same(read_all(damaged_masks(shared, 1.0, tmp_path)), read_all(shared.data / "masks"))
+    alone = read_all(damaged_masks(shared, 0.0, tmp_path))
+    truth = read_all(shared.data / "ground_truth/masks")
+    wrong = {name for name in truth if (alone[name] != truth[name]).any()}
+    train = json.loads((shared.data / "transforms.json").read_text())["train_filenames"]
+    assert len(wrong) > 4 and wrong <= {Path(file).stem for file in train}
+
+
 def test_masks_of_any_number_of_classes_cover_the_training_views(sample, tmp_path):
     found = read_all(class_masks(sample, 5, tmp_path))
     assert len(found) == SMALL["num_train"]
@@ -105,6 +117,9 @@ def test_scenes_are_the_samples_or_the_users_or_both(sample, tmp_path, experimen
     assert [s.name for s in scenes_of(experiment, given)] == ["sample"]
     both = scenes_of(experiment, ExperimentOptions(data=(sample.data,), scenes=1, output=tmp_path, downscale=2.0))
     assert [(s.name, s.downscale) for s in both] == [("tabletop 5", 1.0), ("sample", 2.0)]
+    single = dataclasses.replace(experiment, samples=(("tabletop", 5), ("tabletop", 6)), of_seed={6: {"num_points": 9}})
+    planned = scenes_of(single, ExperimentOptions(output=tmp_path, plan=True))
+    assert [scene.sample and scene.sample.num_points for scene in planned] == [300, 9]
     for wrong, words in [
         ({"scenes": 3}, "--scenes is 3"),
         ({"scenes": 0}, "no scene to train on"),
