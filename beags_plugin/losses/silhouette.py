@@ -1,7 +1,9 @@
-"""The silhouette loss: an object rendered alone covers its mask and nothing else that could be seen (our extension).
+"""The silhouette loss: an object rendered alone covers nothing beside its mask that could be seen (our extension).
 
 In the boundary loss (E7), a Gaussian that others cover weighs next to nothing; once the object is extracted, nothing
-covers it, and it shows. This term looks at the object as extraction renders it.
+covers it, and it shows. This term looks at the object as extraction renders it. It does not ask the object to cover its
+mask: where many masks take in a plinth, the cheapest way would be a spike behind the plinth's surface, which no photo
+contradicts.
 """
 
 from __future__ import annotations
@@ -33,10 +35,10 @@ SLACK = 0.4
 
 @dataclass(frozen=True)
 class SilhouetteLoss(Loss):
-    """Mean over the labelled pixels of |A_c - [M' = c]|, beyond ``SLACK`` at borders, summed over the view's objects c.
+    """Mean over the labelled pixels of A_c where M' != c, beyond ``SLACK`` at borders, summed over the view's objects c.
 
-    A_c is the alpha of the Gaussians of class c rendered alone. Where M' is of another class and the object lies behind
-    what the whole scene shows there, it may be hidden rightly, and the pixel does not count.
+    A_c is the alpha of the Gaussians of class c rendered alone. Where the object lies behind what the whole scene
+    shows, it may be hidden rightly, and the pixel does not count.
 
     objects: how many objects of the view are rendered each step, chosen at random and counted in proportion; each costs
         a render of its Gaussians.
@@ -81,7 +83,6 @@ class SilhouetteLoss(Loss):
         assert inputs.draw is not None and inputs.labels is not None
         if len(members) == 0:
             return inputs.render.color.new_zeros(())
-        inside = inputs.labels == class_id
         alone = inputs.draw(shape_inputs(inputs.surfels, members), inputs.camera)
         assert alone.depth is not None and alone.median_depth is not None
         assert inputs.render.median_depth is not None
@@ -89,12 +90,11 @@ class SilhouetteLoss(Loss):
         depth = torch.where(alone.median_depth > 0, alone.median_depth, alone.depth).detach()
         shown = inputs.render.median_depth.detach()
         hidden = (shown > 0) & (depth > (1.0 + TAU) * shown)
-        outside = known & ~inside & ~hidden
+        outside = known & (inputs.labels != class_id) & ~hidden
         if self.seen > 0:
             of_others = outside & (inputs.labels != 0) & (alone.alpha.detach() > 0) & (depth > shown)
             outside &= ~self._own_surface(of_others, depth, class_id, inputs)
-        wrong = torch.where(inside, 1.0 - alone.alpha, torch.where(outside, alone.alpha, 0.0))
-        return ordered_sum(beyond_slack(wrong, inputs.labels, SLACK))
+        return ordered_sum(beyond_slack(torch.where(outside, alone.alpha, 0.0), inputs.labels, SLACK))
 
     def _own_surface(self, asked: Tensor, depth: Tensor, class_id: int, inputs: LossInputs) -> Tensor:
         """Return the pixels of ``asked`` at whose ``depth`` [H, W] the object's surface goes on, both [H, W] bool."""
