@@ -66,7 +66,6 @@ SHIPPED = {
     "depth": "How much refinement needs of the base's depth: bases trained with and without depth and normal terms.",
     "occupancy": "What the occupancy loss does to the background and to contacts, with the paper's grid and with ours.",
     "masks": "How much damage to the masks costs, with and without reprojection.",
-    "outlines": "How far labels hold refinement back: outlines by votes alone, snapped to photos, and exact masks.",
     "tradeoff": "What time and memory buy: every choice moved alone, and the Pareto front of cost and quality.",
     "presets": "What the refinements of the presets cost and give, from one base.",
     "compare": "The paper's twelve other methods beside this one, from one base, on identical masks.",

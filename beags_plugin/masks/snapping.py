@@ -1,4 +1,4 @@
-"""Outlines of masks that follow edges of the photo."""
+"""Outlines of new masks that follow edges of the photo."""
 
 from __future__ import annotations
 
@@ -10,40 +10,23 @@ from beags_plugin.system.errors import UserError
 EPSILON = 1e-4  # variance of linear colour (0..1) below which the guide counts as flat
 GAMMA = 2.2  # of photos: a pixel across an edge is a mean of both sides in linear light
 _LINEAR = (255.0 * (np.arange(256) / 255.0) ** GAMMA).astype(np.float32)
-NO_FILTER = "this OpenCV has no guided filter: run beags doctor, which names the command that repairs it."
 
 
-def can_snap() -> bool:
-    """Return whether OpenCV has the guided filter; plain OpenCV, installed over contrib, has not."""
-    import cv2
-
-    return hasattr(getattr(cv2, "ximgproc", None), "guidedFilter")
-
-
-def snap_to_edges(
-    labels: np.ndarray,
-    photo: np.ndarray,
-    radius: int,
-    second: np.ndarray | None = None,
-    share: float = 0.5,
-    window: int | None = None,
-) -> np.ndarray:
+def snap_to_edges(labels: np.ndarray, photo: np.ndarray, radius: int) -> np.ndarray:
     """Move outlines of labels [H, W] uint16 to edges of the photo [H, W, 3] uint8 RGB, by a guided filter.
 
-    radius: pixels, the largest distance of a changed label from an outline. second: another opinion of the labels,
-    [H, W] uint16, which counts ``share``, and ``labels`` the rest; wherever it differs, its ids must be near in
-    ``labels``. window: radius of the filter in pixels; ``radius`` if None. Each class's indicator is filtered with the
-    photo as guide, in linear light (He et al., "Guided image filtering"); near outlines the class of the largest value
-    is taken. IGNORE stays. Raises ``UserError`` where OpenCV lacks the filter.
+    radius: pixels, of the filter, and the largest distance of a changed label from an outline. Each class's indicator
+    is filtered with the photo as guide, in linear light (He et al., "Guided image filtering"); near outlines the class
+    of the largest value is taken. IGNORE stays. Raises ``UserError`` where OpenCV lacks the filter, as plain OpenCV
+    does, installed over contrib.
     """
     import cv2
 
-    if not can_snap():
-        raise UserError(NO_FILTER)
+    if not hasattr(getattr(cv2, "ximgproc", None), "guidedFilter"):
+        raise UserError("this OpenCV has no guided filter: run beags doctor, which names the command that repairs it.")
     ids = [int(i) for i in np.unique(labels) if i != IGNORE]
     if radius < 1 or len(ids) < 2:
         return labels
-    window = radius if window is None else window
     kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     # 0..255: with so small an epsilon, OpenCV takes many covariances of a guide in 0..1 as singular, without a word
     guide = _LINEAR[photo]
@@ -53,21 +36,12 @@ def snap_to_edges(
     found = labels.copy()
     for class_id in ids:
         indicator = (labels == class_id).astype(np.float32)
-        if second is not None:
-            indicator = (1.0 - share) * indicator + share * (second == class_id)
-        part = _around(indicator, 4 * window)
-        value = cv2.ximgproc.guidedFilter(
-            np.ascontiguousarray(guide[part]), indicator[part].astype(np.float32), window, EPSILON * 255.0**2
-        )
+        part = _around(indicator, 4 * radius)
+        own_guide, own = np.ascontiguousarray(guide[part]), np.ascontiguousarray(indicator[part])
+        value = cv2.ximgproc.guidedFilter(own_guide, own, radius, EPSILON * 255.0**2)
         larger = value > best[part]
         found[part][larger], best[part][larger] = class_id, value[larger]
     return np.where(near & (labels != IGNORE), found, labels)
-
-
-def own_outlines(voted: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Return ``own`` [H, W] where a pixel of ``voted`` [H, W] next to it is of that class; else ``voted``."""
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(voted, 1, mode="edge"), (3, 3))
-    return np.where((around == own[..., None, None]).any(axis=(-2, -1)), own, voted)
 
 
 def _around(indicator: np.ndarray, margin: int) -> tuple[slice, slice]:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,7 +15,6 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks import REPROJECTIONS
-from beags_plugin.masks.snapping import own_outlines, snap_to_edges
 from beags_plugin.preparation.refiner import Progress
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
@@ -25,15 +23,9 @@ from beags_plugin.system.processes import each_view
 AUTO = "auto"  # pairwise up to the two limits, else voxel
 PAIRWISE_PIXELS = 100_000_000  # in all views; pairwise holds 5 bytes for each: 0.5 GB
 PAIRWISE_PAIRS = 10_000_000_000  # of a voting pixel and a view: 7 to 9 ns each on one core at 256 x 192
-OUTLINE = 1  # pixels: outlines snap no farther
-WINDOW = 2  # pixels around that say what colour each class has there
-OWN = 0.4  # what the view's own mask counts at outlines, the votes the rest: docs/results.md, "Outlines"
 
 Stage = Callable[[str], AbstractContextManager[Progress | None]]
 """Opens a named stage and returns its progress callback, such as a progress bar."""
-
-Photos = Callable[[int], Tensor]
-"""Returns the photo of a view, [H, W, 3] float32 in 0..1."""
 
 
 @dataclass(frozen=True)
@@ -85,13 +77,12 @@ def reprojected_masks(
     masks: LabelMaps,
     known: ClassRanks,
     config,
-    photos: Photos | None,
     progress: Progress | None = None,
 ) -> ConsistentMasks:
     """Return the labels of all views, voted by the views with masks; voted views are held one at a time.
 
     depths: per view [H, W], of the surface, perhaps on disk. config: a ``PreparationConfig`` with a registered
-    reprojection. photos: needed for ``config.snap``.
+    reprojection.
     """
     given = translated(masks, known, known.ranks)
     ranked, consistent, confidence = LabelMaps(), LabelMaps(), CompressedMaps()
@@ -99,10 +90,6 @@ def reprojected_masks(
     for mask in reproject(depths, cameras, given, len(known), tau=config.tau, progress=progress):
         own = given[len(ranked)]
         labels = with_own_parts(mask.labels, mask.confidence, own, config.overrule)
-        if config.snap:
-            if photos is None:
-                raise ValueError("outlines cannot snap without photos")
-            labels = with_snapped_outlines(labels, own, photos(len(ranked)))
         ranked.append(labels)
         confidence.append((mask.confidence * 255.0 + 0.5).to(torch.uint8))
         if config.min_confidence > 0.0:
@@ -132,25 +119,6 @@ def with_own_parts(voted: Tensor, confidence: Tensor, own: Tensor | None, overru
     square = torch.nn.functional.avg_pool2d(differs[None, None].float(), 2, stride=1) == 1.0  # 2 x 2, all of them
     thick = torch.nn.functional.max_pool2d(square.float(), 2, stride=1, padding=1)[0, 0] > 0
     return torch.where(differs & thick, own, voted)
-
-
-def with_snapped_outlines(voted: Tensor, own: Tensor | None, photo: Tensor) -> Tensor:
-    """Decide the pixels at outlines by the votes, the view's own mask and the edges of its photo (method, section 10).
-
-    The votes place an outline where the depth of the base has it, more often too far out than too far in. Own masks err
-    there too, but each otherwise, so that their errors average away over the views.
-
-    voted: [H, W] int, M' of the votes. own: [H, W] int, the mask as given, or None; it counts where a voted pixel next
-    to it has its class. photo: [H, W, 3] float32 in 0..1.
-    """
-    ids = _as_array(voted)
-    second = None if own is None else own_outlines(ids, _as_array(own))
-    pixels = (255.0 * photo + 0.5).to(torch.uint8).cpu().numpy()
-    return torch.from_numpy(snap_to_edges(ids, pixels, OUTLINE, second, OWN, WINDOW).astype(np.int32)).to(voted.device)
-
-
-def _as_array(labels: Tensor) -> np.ndarray:
-    return labels.cpu().numpy().astype(np.uint16)
 
 
 def translated(labels: LabelMaps, known: ClassRanks, table: Callable[[Tensor], Tensor]) -> LabelMaps:

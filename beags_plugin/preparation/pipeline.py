@@ -19,13 +19,11 @@ from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks import REPROJECTIONS
-from beags_plugin.masks.snapping import NO_FILTER, can_snap
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.preparation.border_split import BorderSplitConfig, split_at_borders
 from beags_plugin.preparation.consistent_masks import (
     AUTO,
     ConsistentMasks,
-    Photos,
     Stage,
     chosen_reprojection,
     masks_as_they_are,
@@ -53,9 +51,6 @@ class PreparationConfig:
     """Reprojected pixels whose winner has a smaller share of the votes are left out of the losses."""
     tau: float = 0.02
     """Of pairwise: a vote counts if its point is visible, |z - depth| <= tau z; inf counts every vote (E5)."""
-    snap: bool = False
-    """Whether the outlines of reprojected masks follow the view's own mask and the edges of its photo too, within a
-    pixel. In the paper the votes decide alone."""
     overrule: float = 0.0
     """Least share of the votes that overrules a view's own mask, but in parts thinner than two pixels, where any
     majority does; 0, as in the paper: everywhere."""
@@ -133,7 +128,6 @@ def prepare(
     background_voxels: bool = True,
     seed: int = 0,
     scale: float = 1.0,
-    photos: Photos | None = None,
     stage: Stage = lambda name: nullcontext(),
 ) -> Preparation:
     """Make labels consistent, assign classes, split at boundaries if the refiner trains, build the voxel grids.
@@ -142,7 +136,7 @@ def prepare(
     cameras: V training views; labels: per view [H, W] int32 class ids or IGNORE, or None; held as ``LabelMaps``.
     class_names: id to name with background (0), in any range: the stages work on ranks.
     background_voxels: False drops the voxels of the background, for losses that ignore it.
-    scale: units of the scene's frame per unit of the input poses'. photos: of the views; needed for ``config.snap``.
+    scale: units of the scene's frame per unit of the input poses'.
     Data as large as the photos lies in temporary files: memory grows by compressed labels per view and by voxels. Only
     "pairwise" reads depth and labels of all views into memory.
     Raises ``UserError`` if no mask names an object.
@@ -155,7 +149,7 @@ def prepare(
     seconds: dict[str, float] = {}
 
     with _timed("reprojection", seconds):
-        masks = _consistent_masks(surfels, cameras, maps, known, rasterizer, settings, config, photos, stage, summary)
+        masks = _consistent_masks(surfels, cameras, maps, known, rasterizer, settings, config, stage, summary)
     ranked = masks.ranked
 
     with _timed("assignment", seconds), stage("Assigning classes") as progress:
@@ -229,21 +223,18 @@ def _timed(name: str, seconds: dict[str, float]) -> Iterator[None]:
 
 def _consistent_masks(
     surfels, cameras, maps: LabelMaps, known: ClassRanks, rasterizer, settings, config,
-    photos: Photos | None, stage: Stage, summary: list[str],
+    stage: Stage, summary: list[str],
 ) -> ConsistentMasks:  # fmt: skip
     """Return the labels of all views, reprojected unless that is off, and add lines to ``summary``."""
     if config.reprojection == "none":
         summary.append("reprojection: off, masks used as they are")
         return masks_as_they_are(maps, cameras, known)
-    if config.snap and not can_snap():
-        summary.append(f"outlines are not snapped: {NO_FILTER}")
-        config = replace(config, snap=False)
     method, why = chosen_reprojection(config.reprojection, cameras, maps)
     with stage("Rendering depth") as progress:  # as large as all photos in float
         rendered = render_depths(surfels, cameras, rasterizer, settings, config.depth, progress)
         depths = filed(rendered, surfels.means.device)
     with stage("Reprojecting masks") as progress:
-        masks = reprojected_masks(depths, cameras, maps, known, replace(config, reprojection=method), photos, progress)
+        masks = reprojected_masks(depths, cameras, maps, known, replace(config, reprojection=method), progress)
     if why is not None:
         summary.append(why)
     summary.append(reprojection_summary(maps, masks.labels))

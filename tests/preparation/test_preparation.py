@@ -13,7 +13,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import LabelMaps
-from beags_plugin.preparation import consistent_masks, pipeline
+from beags_plugin.preparation import consistent_masks
 from beags_plugin.preparation.consistent_masks import chosen_reprojection, with_own_parts
 from beags_plugin.preparation.pipeline import PreparationConfig, prepare
 from beags_plugin.rasterizers import make_rasterizer
@@ -77,38 +77,6 @@ def test_own_parts_come_back_whole_but_nothing_thinner_than_two_pixels():
     sure[3, 4] = 0.96  # what is left above it is no 2 x 2 pixels anywhere
     expected[2:4] = 0
     assert torch.equal(with_own_parts(voted, sure, own, 0.95), expected)
-
-
-def test_outlines_snap_to_photos_which_must_be_there(monkeypatch):
-    cameras, names = [CAMERA] * 2, {0: "background", 1: "one"}
-    disc = Surfels.of(
-        torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 2), 1.0),
-        torch.tensor([3.0]), torch.zeros(1, 1, 3),
-    )  # fmt: skip
-    straight = torch.zeros(SIZE, SIZE, dtype=torch.int32)
-    straight[:, SIZE // 2 :] = 1
-    mask = straight.clone()
-    mask[SIZE // 2, SIZE // 2] = 0  # a notch
-    rasterizer, settings = make_rasterizer("torch"), RasterSettings(0.1, 100.0)
-
-    def prepared_with_snap(**photos):
-        config = PreparationConfig(k=1, snap=True)
-        return prepare(disc, cameras, [mask] * 2, names, rasterizer, settings, NoRefiner(), config, **photos)
-
-    def labels(**photos):
-        return prepared_with_snap(**photos).labels
-
-    def photo_of(objects):
-        return lambda index: objects[..., None].expand(-1, -1, 3).float()
-
-    assert all(torch.equal(found, straight) for found in labels(photos=photo_of(straight)))
-    assert all(torch.equal(found, mask) for found in labels(photos=photo_of(mask)))
-    with pytest.raises(ValueError, match="without photos"):
-        labels()
-    monkeypatch.setattr(pipeline, "can_snap", lambda: False)  # as with plain OpenCV
-    found = prepared_with_snap(photos=photo_of(straight))
-    assert all(torch.equal(each, mask) for each in found.labels)
-    assert any(line.startswith("outlines are not snapped: this OpenCV") for line in found.summary)
 
 
 @pytest.mark.parametrize(

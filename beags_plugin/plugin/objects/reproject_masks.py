@@ -96,8 +96,8 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     config = replace(scene.config.model_config.prepare, **{k: v for k, v in own.items() if v is not None})
     if config.reprojection == "none":
         config = replace(config, reprojection="voxel")
-    # a run that is given these masks snaps them; what overrules its own masks there has this consensus
-    config = replace(config, min_confidence=0.0, snap=False, overrule=0.0)
+    # what overrules the masks of a run that is given these has this consensus
+    config = replace(config, min_confidence=0.0, overrule=0.0)
     config.check()
     start = time.perf_counter()
     views = manager.views("train")
@@ -115,7 +115,7 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
         depths = filed(rendered, surfels.means.device)
     with progress_bar("Reprojecting masks") as progress:
         known = known_classes(given, classes)
-        masks = reprojected_masks(depths, cameras, given, known, config, None, progress)
+        masks = reprojected_masks(depths, cameras, given, known, config, progress)
     assert masks.confidence is not None
     names = [view.name for view in views]
     seconds = time.perf_counter() - start

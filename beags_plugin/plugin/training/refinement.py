@@ -215,7 +215,6 @@ class RefinementSwitch:
                     background_voxels=self._background_voxels(),
                     seed=model.seed,
                     scale=self._scale(),
-                    photos=lambda index: views[index].image,
                     stage=bar,
                 )
             for line in prepared.summary:
