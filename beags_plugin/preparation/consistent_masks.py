@@ -88,37 +88,17 @@ def reprojected_masks(
     ranked, consistent, confidence = LabelMaps(), LabelMaps(), CompressedMaps()
     reproject = REPROJECTIONS.get(config.reprojection)
     for mask in reproject(depths, cameras, given, len(known), tau=config.tau, progress=progress):
-        own = given[len(ranked)]
-        labels = with_own_parts(mask.labels, mask.confidence, own, config.overrule)
-        ranked.append(labels)
+        ranked.append(mask.labels)
         confidence.append((mask.confidence * 255.0 + 0.5).to(torch.uint8))
         if config.min_confidence > 0.0:
             # for the losses alone: the border split looks for the very boundaries that are doubtful
             doubtful = mask.confidence < config.min_confidence
-            consistent.append(_translated(labels, known.class_ids).masked_fill_(doubtful, IGNORE))
+            consistent.append(_translated(mask.labels, known.class_ids).masked_fill_(doubtful, IGNORE))
     if len(ranked) != len(cameras):
         raise ValueError(f"the reprojection {config.reprojection!r} gave {len(ranked)} masks for {len(cameras)} views")
     if config.min_confidence == 0.0:
         consistent = translated(ranked, known, known.class_ids)
     return ConsistentMasks(ranked, consistent, confidence)
-
-
-def with_own_parts(voted: Tensor, confidence: Tensor, own: Tensor | None, overrule: float) -> Tensor:
-    """Return voted labels, with those of the view's own mask where votes are too divided to overrule it.
-
-    Where the base puts a surface before the true one, as in dark gaps between things, many views vote for what stands
-    behind it. At outlines the own mask errs more than the votes: so where less than 2 x 2 pixels are so divided, they
-    stay as voted.
-
-    voted, own: [H, W] int; own is None in a view without a mask, and IGNORE names nothing. confidence: [H, W] float,
-    the winner's share of the votes. overrule: least share that overrules; 0 returns ``voted``.
-    """
-    if own is None or overrule == 0.0:
-        return voted
-    differs = (voted != own) & (own != IGNORE) & (confidence < overrule)
-    square = torch.nn.functional.avg_pool2d(differs[None, None].float(), 2, stride=1) == 1.0  # 2 x 2, all of them
-    thick = torch.nn.functional.max_pool2d(square.float(), 2, stride=1, padding=1)[0, 0] > 0
-    return torch.where(differs & thick, own, voted)
 
 
 def translated(labels: LabelMaps, known: ClassRanks, table: Callable[[Tensor], Tensor]) -> LabelMaps:

@@ -51,9 +51,6 @@ class PreparationConfig:
     """Reprojected pixels whose winner has a smaller share of the votes are left out of the losses."""
     tau: float = 0.02
     """Of pairwise: a vote counts if its point is visible, |z - depth| <= tau z; inf counts every vote (E5)."""
-    overrule: float = 0.0
-    """Least share of the votes that overrules a view's own mask, but in parts thinner than two pixels, where any
-    majority does; 0, as in the paper: everywhere."""
     depth: str = "median"
     """Which depth is lifted: median or expected."""
     k: int = 2000
@@ -76,8 +73,6 @@ class PreparationConfig:
         if not 0.0 <= self.min_confidence <= 1.0:
             raise UserError(f"min_confidence is {self.min_confidence}: it must be a share of the votes, 0 to 1.")
         check_surface_depth(self.depth)
-        if not 0.0 <= self.overrule <= 1.0:
-            raise UserError(f"overrule is {self.overrule}: it must be a share of the votes, 0 to 1.")
         if not self.tau >= 0:
             raise UserError(f"tau is {self.tau}: it must be 0 or more (inf counts every vote).")
         if not self.k >= 1:

@@ -34,7 +34,6 @@ mistakes(
         "objects that could share their Gaussians": refiner("trace3d", "member_share", "0.3"),
         "an unknown reprojection": model("prepare.reprojection", "guess"),
         "an unknown kind of depth": model("prepare.depth", "mean"),
-        "votes that never overrule": model("prepare.overrule", "1.5"),
         "negative steps of refinement": model("refine-steps", "-5"),
         "no steps at all": trained("--pipeline.model.base-steps", "0", "--pipeline.model.refine-steps", "0"),
         "no rounds of refinement": model("refine-rounds", "0"),

@@ -14,7 +14,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.preparation import consistent_masks
-from beags_plugin.preparation.consistent_masks import chosen_reprojection, with_own_parts
+from beags_plugin.preparation.consistent_masks import chosen_reprojection
 from beags_plugin.preparation.pipeline import PreparationConfig, prepare
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
@@ -51,32 +51,6 @@ def test_a_view_without_a_mask_gets_what_the_others_vote_and_in_a_tie_each_keeps
 def test_doubtful_pixels_may_be_left_out():
     assert prepared([1, 2, 2, 1, 2], min_confidence=0.5) == [[2]] * 5  # 3 of 5 votes
     assert prepared([1, 2, 2, 1, 2], min_confidence=0.7) == [[IGNORE]] * 5
-
-
-def test_divided_votes_leave_a_view_its_own_mask_where_the_paper_lets_any_majority_win():
-    assert prepared([1, 2, 2, 1, 2], overrule=0.7) == [[1], [2], [2], [1], [2]]  # 3 of 5 votes
-    assert prepared([1, 2, 2, 1, 2], overrule=0.6) == [[2]] * 5
-    assert prepared([1, None, 2, 2], overrule=0.7) == [[1], [2], [2], [2]]
-    with pytest.raises(UserError, match="overrule is 2: it must be a share of the votes, 0 to 1"):
-        PreparationConfig(overrule=2).check()
-
-
-def test_own_parts_come_back_whole_but_nothing_thinner_than_two_pixels():
-    voted = torch.zeros(10, 12, dtype=torch.int32)
-    own = voted.clone()
-    own[2:6, 3:6] = 1
-    own[6, 4] = 1  # hangs on, one pixel wide
-    own[0, :] = 2  # an outline
-    own[7:9, 8:10] = IGNORE
-    sure = torch.full((10, 12), 0.9)
-    assert torch.equal(with_own_parts(voted, sure, own, 0.7), voted)
-    assert with_own_parts(voted, sure, None, 0.95) is voted and with_own_parts(voted, sure, own, 0.0) is voted
-    expected = voted.clone()
-    expected[2:6, 3:6] = 1
-    assert torch.equal(with_own_parts(voted, sure, own, 0.95), expected)
-    sure[3, 4] = 0.96  # what is left above it is no 2 x 2 pixels anywhere
-    expected[2:4] = 0
-    assert torch.equal(with_own_parts(voted, sure, own, 0.95), expected)
 
 
 @pytest.mark.parametrize(
