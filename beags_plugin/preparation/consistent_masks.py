@@ -85,20 +85,14 @@ def reprojected_masks(
     reprojection.
     """
     given = translated(masks, known, known.ranks)
-    ranked, consistent, confidence = LabelMaps(), LabelMaps(), CompressedMaps()
+    ranked, confidence = LabelMaps(), CompressedMaps()
     reproject = REPROJECTIONS.get(config.reprojection)
     for mask in reproject(depths, cameras, given, len(known), tau=config.tau, progress=progress):
         ranked.append(mask.labels)
         confidence.append((mask.confidence * 255.0 + 0.5).to(torch.uint8))
-        if config.min_confidence > 0.0:
-            # for the losses alone: the border split looks for the very boundaries that are doubtful
-            doubtful = mask.confidence < config.min_confidence
-            consistent.append(_translated(mask.labels, known.class_ids).masked_fill_(doubtful, IGNORE))
     if len(ranked) != len(cameras):
         raise ValueError(f"the reprojection {config.reprojection!r} gave {len(ranked)} masks for {len(cameras)} views")
-    if config.min_confidence == 0.0:
-        consistent = translated(ranked, known, known.class_ids)
-    return ConsistentMasks(ranked, consistent, confidence)
+    return ConsistentMasks(ranked, translated(ranked, known, known.class_ids), confidence)
 
 
 def translated(labels: LabelMaps, known: ClassRanks, table: Callable[[Tensor], Tensor]) -> LabelMaps:

@@ -47,8 +47,6 @@ class PreparationConfig:
     reprojection: str = AUTO
     """How the views' masks are made to agree: pairwise (exact), voxel (quick), auto (the one that fits the number of
     views), none (the masks stay as they are), or a registered one."""
-    min_confidence: float = 0.0
-    """Reprojected pixels whose winner has a smaller share of the votes are left out of the losses."""
     tau: float = 0.02
     """Of pairwise: a vote counts if its point is visible, |z - depth| <= tau z; inf counts every vote (E5)."""
     depth: str = "median"
@@ -70,8 +68,6 @@ class PreparationConfig:
         REPROJECTIONS.check(self.reprojection, AUTO, "none")
         if self.reprojection not in (AUTO, "none"):
             REPROJECTIONS.get(self.reprojection)  # that of another package may not load
-        if not 0.0 <= self.min_confidence <= 1.0:
-            raise UserError(f"min_confidence is {self.min_confidence}: it must be a share of the votes, 0 to 1.")
         check_surface_depth(self.depth)
         if not self.tau >= 0:
             raise UserError(f"tau is {self.tau}: it must be 0 or more (inf counts every vote).")

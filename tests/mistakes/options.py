@@ -41,7 +41,6 @@ mistakes(
         "k is 0": model("prepare.k", "0"),
         "k is negative": model("prepare.k", "-1"),
         "tau is not a number": model("prepare.tau", "nan"),
-        "a confidence above 1": model("prepare.min-confidence", "2"),
         "a degree of 9": model("sh-degree", "9"),
         "a degree of -1": model("sh-degree", "-1"),
         "a degree every 0 steps": model("sh-degree-interval", "0"),

@@ -1,4 +1,4 @@
-"""Preparation of refinement: who votes, what is doubtful, and what is refused."""
+"""Preparation of refinement: who votes, and what is refused."""
 
 from __future__ import annotations
 
@@ -46,11 +46,6 @@ def test_all_views_vote():
 def test_a_view_without_a_mask_gets_what_the_others_vote_and_in_a_tie_each_keeps_its_own():
     assert prepared([1, None, 2, 2]) == [[2]] * 4
     assert prepared([1, None, 2]) == [[1], [IGNORE], [2]]
-
-
-def test_doubtful_pixels_may_be_left_out():
-    assert prepared([1, 2, 2, 1, 2], min_confidence=0.5) == [[2]] * 5  # 3 of 5 votes
-    assert prepared([1, 2, 2, 1, 2], min_confidence=0.7) == [[IGNORE]] * 5
 
 
 @pytest.mark.parametrize(

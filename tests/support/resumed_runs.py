@@ -37,7 +37,6 @@ def short_config(data: Path, run: Path, **overrides):
         "pipeline.model.sh_degree_interval": 15,
         "pipeline.model.background_color": "random",
         "pipeline.model.prepare.k": 10,
-        "pipeline.model.prepare.min_confidence": 0.3,
         "steps_per_save": 7,
         "steps_per_eval_image": 11,  # the last base step too
         "steps_per_held_out": 10,

@@ -96,7 +96,6 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     config = replace(scene.config.model_config.prepare, **{k: v for k, v in own.items() if v is not None})
     if config.reprojection == "none":
         config = replace(config, reprojection="voxel")
-    config = replace(config, min_confidence=0.0)
     config.check()
     start = time.perf_counter()
     views = manager.views("train")
