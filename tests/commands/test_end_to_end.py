@@ -204,33 +204,6 @@ def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, 
     assert (tmp_path / "resumed" / "base" / "config.yml").exists()
 
 
-def test_refinement_of_a_base_makes_masks_again_also_after_a_resume(trained, data, tmp_path):
-    from beags_plugin.plugin.runs.layout import last_prepared
-    from beags_plugin.plugin.runs.read import read_assigned_run
-
-    folder, _ = trained
-    options = (
-        "--data", data, "--vis", "tensorboard", "--steps-per-eval-image", 0, "--pipeline.model.prepare.k", 200,
-        "--pipeline.model.refine-steps", 12, "--pipeline.model.refine-rounds", 2,
-    )  # fmt: skip
-    base = ("--load-dir", folder / "base" / "nerfstudio_models")
-    whole, half, resumed = tmp_path / "whole", tmp_path / "half", tmp_path / "resumed"
-    text = called("ns-train", "beags-refine", "--run-dir", whole, *options, *base)
-    assert "assignment: Gaussians per class" in text and "Preparing refinement again" in text
-    assert (whole / "nerfstudio_models" / "step-000000011.ckpt").exists()
-    first, second = (sorted((path / "masks").glob("*.png")) for path in (whole / "prepared", last_prepared(whole)))
-    assert [path.name for path in first] == [path.name for path in second] and first != second
-    assert any(a.read_bytes() != b.read_bytes() for a, b in zip(first, second, strict=True))
-    called("ns-train", "beags-refine", "--run-dir", half, "--max-num-iterations", 6, *options, *base)
-    assert last_prepared(half) == half / "prepared"
-    text = called("ns-train", "beags-refine", "--run-dir", resumed, *options, "--load-dir", half / "nerfstudio_models")
-    assert "refinement taken up" in text and "Preparing refinement again" in text
-    a, b = read_assigned_run(whole / "config.yml"), read_assigned_run(resumed / "config.yml")
-    assert int(b.state["refined_steps"]) == 12 and a.state["class_ids"].shape == b.state["class_ids"].shape
-    for mask in second:
-        assert mask.read_bytes() == (last_prepared(resumed) / "masks" / mask.name).read_bytes(), mask.name
-
-
 def test_a_trained_scene_is_rendered_whole_cropped_and_by_object(trained):
     import torch
     from nerfstudio.data.scene_box import OrientedBox

@@ -36,7 +36,6 @@ mistakes(
         "an unknown kind of depth": model("prepare.depth", "mean"),
         "negative steps of refinement": model("refine-steps", "-5"),
         "no steps at all": trained("--pipeline.model.base-steps", "0", "--pipeline.model.refine-steps", "0"),
-        "no rounds of refinement": model("refine-rounds", "0"),
         "a negative step to stop at": trained(max_num_iterations=-3),
         "k is 0": model("prepare.k", "0"),
         "k is negative": model("prepare.k", "-1"),

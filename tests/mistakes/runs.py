@@ -80,7 +80,7 @@ mistakes(
     "configs",
     {
         "a class that has been renamed": replaced("model_options.BeagsModelConfig", "model_options.SceneConfig"),
-        "of an older version": replaced("run_format: 2\n", ""),
+        "of an older version": replaced("run_format: 3\n", ""),
         "a part of another kind": config(
             lambda text: re.sub(r"prepare: !!python/object:\S+", "prepare: !!python/object:builtins.dict", text)
         ),

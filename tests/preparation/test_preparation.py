@@ -102,14 +102,3 @@ def test_k_follows_the_training_pixels_where_it_is_stated_for_more():
     assert PreparationConfig(k=4, k_pixels=10**9).neighbours(cameras) == 4
     with pytest.raises(UserError, match="k_pixels is -1"):
         PreparationConfig(k_pixels=-1).check()
-
-
-def test_more_rounds_than_steps_are_refused():
-    pytest.importorskip("nerfstudio")
-    from beags_plugin.plugin.options.config import base_config
-    from beags_plugin.plugin.training.refinement import RefinementSwitch
-
-    config = base_config().model_config
-    config.refine_steps, config.refine_rounds = 3, 4
-    with pytest.raises(UserError, match="refine_rounds is 4: it must be 1 to refine_steps, which is 3"):
-        RefinementSwitch(SimpleNamespace(config=config), None, None).check()

@@ -38,7 +38,7 @@ import same_bits  # noqa: E402
 from beags_plugin.bench.provenance import commit, describe_machine  # noqa: E402
 
 OPTIONS = {
-    "pipeline.model.base_steps": 80, "pipeline.model.refine_steps": 30, "pipeline.model.refine_rounds": 2,
+    "pipeline.model.base_steps": 80, "pipeline.model.refine_steps": 30,
     "pipeline.model.densify.start": 20, "pipeline.model.densify.stop": 70, "pipeline.model.densify.every": 20,
     "pipeline.model.densify.max_surfels": 2500, "pipeline.model.prepare.k": 200, "steps_per_save": 5,
     "steps_per_held_out": 40, "vis": "tensorboard",

@@ -20,13 +20,12 @@ class Killed(BaseException):
 
 
 def short_config(data: Path, run: Path, **overrides):
-    """Return a run of all phases in a second: growth, two rounds of preparation, a curve, frequent checkpoints."""
+    """Return a run of all phases in a second: growth, preparation, a curve, frequent checkpoints."""
     from beags_plugin.plugin.presets import preset_config
 
     values = {
         "pipeline.model.base_steps": STEPS[0],
         "pipeline.model.refine_steps": STEPS[1],
-        "pipeline.model.refine_rounds": 2,
         "pipeline.model.densify.start": 5,
         "pipeline.model.densify.every": 10,
         "pipeline.model.densify.stop": 40,
@@ -107,10 +106,10 @@ def assert_same_run(one: Path, other: Path, but_for: str = "nothing"):
     assert not found, found[:9]
     curves = [without_clocks(json.loads((run / "held_out.json").read_text())) for run in (one, other)]
     assert curves[0] == curves[1] and len(curves[0]) >= 5
-    for folder in ("prepared/masks", "prepared/round_2/masks"):
-        files = sorted(path.name for path in (one / folder).iterdir())
-        assert files and files == sorted(path.name for path in (other / folder).iterdir())
-        assert all((one / folder / name).read_bytes() == (other / folder / name).read_bytes() for name in files)
+    folders = one / "prepared/masks", other / "prepared/masks"
+    files = sorted(path.name for path in folders[0].iterdir())
+    assert files and files == sorted(path.name for path in folders[1].iterdir())
+    assert all((folders[0] / name).read_bytes() == (folders[1] / name).read_bytes() for name in files)
 
 
 def kill_at(monkeypatch, step, after=False):

@@ -139,15 +139,15 @@ def state_of(surfels: Surfels, class_ids: torch.Tensor, assigned: bool = True, s
     }
 
 
-def write_prepared(run: Path, shift: int = 0, later: str = "", scale: float = 1.0) -> None:
+def write_prepared(run: Path, shift: int = 0, scale: float = 1.0) -> None:
     """Write masks after reprojection, and a grid in which all left of the middle is valid for the cup.
 
-    Masks are those of the data moved down by ``shift`` rows. later: folder of a later round; scale: of the world.
+    Masks are those of the data moved down by ``shift`` rows. scale: of the world.
     """
     from beags_plugin.labels.classes import write_mask
     from beags_plugin.occupancy.grid import VisibilityGrid
 
-    folder = run / "prepared" / later
+    folder = run / "prepared"
     (folder / "masks").mkdir(parents=True)
     ids = np.zeros((12, 20), np.uint8)
     ids[4:9, 4:9], ids[4:8, 11:15] = 1, 2

@@ -20,7 +20,7 @@ from beags_plugin.extraction.ply import write_ply
 from beags_plugin.extraction.select import remove_class, select_class
 from beags_plugin.plugin.objects.clean import cleaner_of
 from beags_plugin.plugin.runs.checkpoint_file import exposures_of, extra_state
-from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, prepared_digests
+from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, digest_of_prepared
 from beags_plugin.plugin.runs.read import SavedScene, read_assigned_run, read_transform
 from beags_plugin.plugin.runs.write import write_run
 from beags_plugin.system.errors import UserError, check_choice, writing
@@ -71,7 +71,7 @@ def extract_objects(
     with writing(target):
         target.mkdir(parents=True, exist_ok=True)
     cleaner = None if keep_all or remove else cleaner_of(scene, config_path)
-    prepared = prepared_digests(run)  # shows later if the run was trained again
+    prepared = digest_of_prepared(run)  # shows later if the run was trained again
     written = []
     for name in names:
         surfels, index = select(scene.surfels(), members, ids[name])

@@ -9,7 +9,7 @@ from pathlib import Path
 from beags_plugin.cleaning.silhouettes import MaskedViews
 from beags_plugin.core.exposure import Exposures
 from beags_plugin.labels.label_maps import LabelMaps
-from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, last_prepared, preparing_run
+from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, PREPARED, preparing_run
 from beags_plugin.plugin.runs.prepared import prepared_labels
 from beags_plugin.plugin.runs.read import SavedScene, data_of_run, raster_settings
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
@@ -60,7 +60,7 @@ def shown_scene(scene: SavedScene, config_path: Path) -> ShownScene:
         raise Unshown("the run is part of a scene, which does not show what hides it")
     if scene.picked:
         raise Unshown("its objects were picked in the viewer, and the masks that the run has kept are of others")
-    folder = last_prepared(preparing_run(run))
+    folder = preparing_run(run) / PREPARED
     if not (folder / "grid.pt").exists():
         raise Unshown("the run has kept no masks")
     try:

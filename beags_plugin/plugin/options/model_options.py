@@ -58,9 +58,6 @@ class BeagsModelConfig(ModelConfig):
     """Steps of base training; 0 for a refinement that starts from a loaded base."""
     refine_steps: int = 3_000
     """Steps of refinement; 0 trains a base only."""
-    refine_rounds: int = 1
-    """How often masks, classes and voxel grids are made, at even distances of refinement: each round starts again from
-    the masks of the data, with the depth of the scene as it then is. 1, as in the paper: before refinement alone."""
     schedule_steps: Suppress[int] = 30_000
     """Length of base training for which all other steps and intervals of the base are stated; with another base_steps
     they are scaled in proportion. 0: they are taken as they are."""

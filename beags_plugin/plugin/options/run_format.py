@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from beags_plugin.system.errors import UserError
 
-RUN_FORMAT = 2
+RUN_FORMAT = 3
 """Written to config.yml; a run of another version is refused."""
 
 

@@ -40,10 +40,6 @@ class PhaseSchedule:
         """Return whether ``step`` belongs to refinement."""
         return step >= self.base_steps
 
-    def round_starts(self, rounds: int) -> list[int]:
-        """Return the steps of refinement before which masks, classes and grids are made, the first of them 0."""
-        return [self.refine_steps * index // rounds for index in range(rounds)]
-
     def progress(self, step: int) -> float:
         """Return the position in the base's learning-rate schedule, 0..1; refinement from 0.9, polish from 0.5."""
         if not self.refining(step):

@@ -26,11 +26,6 @@ def newest_checkpoint(folder: Path) -> Path:
     return checkpoints[-1]
 
 
-def round_folder(run: Path, index: int) -> Path:
-    """Return the folder of the masks and grid of this refinement round, from 0."""
-    return run / PREPARED if index == 0 else run / PREPARED / f"round_{index + 1}"
-
-
 def preparing_run(run: Path) -> Path:
     """Return the run that prepared ``run``: itself, or the one that it is the base or an extract of."""
     origin = run / EXTRACTION_FILE
@@ -42,18 +37,13 @@ def preparing_run(run: Path) -> Path:
     return run.parent if run.name == BASE_SNAPSHOT and (run.parent / PREPARED).is_dir() else run
 
 
-def prepared_digests(run: Path) -> list[str] | None:
-    """Return a digest of the masks and grid of each prepared round of ``run``.
+def digest_of_prepared(run: Path) -> str | None:
+    """Return a digest of the masks and the grid that refinement of ``run`` was prepared with, if it was.
 
-    Of an extract they are those at the time of the extraction; None if its file has none.
+    Of an extract it is that at the time of the extraction; None if its file has none.
     """
     origin = run / EXTRACTION_FILE
-    if origin.exists():
-        return _origin(origin, "prepared", list, None)
-    digests = []
-    while (digest := round_digest(round_folder(preparing_run(run), len(digests)))) is not None:
-        digests.append(digest)
-    return digests
+    return _origin(origin, "prepared", str, None) if origin.exists() else files_digest(preparing_run(run) / PREPARED)
 
 
 def _origin(path: Path, name: str, kind: type, absent: Any) -> Any:
@@ -67,16 +57,7 @@ def _origin(path: Path, name: str, kind: type, absent: Any) -> Any:
     return found
 
 
-def round_digest(folder: Path) -> str | None:
-    """Return a digest of the masks and the grid in the folder of a round; None if none was prepared there."""
-    if not (folder / "grid.pt").exists():
-        return None
-    return content_digest([folder / "grid.pt", *sorted((folder / "masks").glob("*.png"))])
-
-
-def last_prepared(run: Path) -> Path:
-    """Return the folder of the last prepared round of a run; the first round's if none was prepared."""
-    index = 0
-    while (round_folder(run, index + 1) / "grid.pt").exists():
-        index += 1
-    return round_folder(run, index)
+def files_digest(folder: Path) -> str:
+    """Return a digest of the masks and the grid in a folder; that of no file if none was prepared there."""
+    whole = (folder / "grid.pt").exists()
+    return content_digest([folder / "grid.pt", *sorted((folder / "masks").glob("*.png"))] if whole else [])

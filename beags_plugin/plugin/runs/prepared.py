@@ -15,7 +15,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.labels.classes import read_id_mask, read_mask
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED, last_prepared
+from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED
 from beags_plugin.plugin.views.views import unique_names
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.tensors import load_tensors
@@ -31,7 +31,7 @@ _REMEDY = "restore it, or refine again from base/nerfstudio_models"
 
 
 def read_grid(path: Path) -> VisibilityGrid | None:
-    """Read the grid of a prepared round; None where the refiner needs none. Raises ``UserError`` if damaged."""
+    """Read the grid of a prepared refinement; None where the refiner needs none. Raises ``UserError`` if damaged."""
     state = grid_state(path)
     return VisibilityGrid.from_state_dict(state) if state else None
 
@@ -105,7 +105,7 @@ def training_masks(config: BeagsTrainerConfig) -> list[TrainingMasks]:
     outputs = parser.setup().get_dataparser_outputs("train")
     metadata = outputs.metadata
     exact = (metadata["ground_truth"] or {}).get("masks") or [None] * len(outputs.image_filenames)
-    prepared = last_prepared(config.get_base_dir())
+    prepared = config.get_base_dir() / PREPARED
     views = []
     for index, (name, photo) in enumerate(
         zip(unique_names(outputs.image_filenames), outputs.image_filenames, strict=True)

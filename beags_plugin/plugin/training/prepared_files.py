@@ -13,7 +13,6 @@ import torch
 from PIL import Image
 
 from beags_plugin.labels.classes import write_mask
-from beags_plugin.plugin.runs.layout import PREPARED
 from beags_plugin.plugin.runs.prepared import PREPARATION_REPORT
 from beags_plugin.plugin.training.contradiction import Residuals
 from beags_plugin.preparation.pipeline import Preparation
@@ -36,8 +35,7 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path, fit: Re
     """
     with writing(folder):
         (folder / "grid.pt").unlink(missing_ok=True)  # an earlier run's
-        if folder.name == PREPARED:
-            clear(folder)
+        clear(folder)
         (folder / "masks").mkdir(parents=True, exist_ok=True)
         (folder / "confidence").mkdir(exist_ok=True)
     with bar("Keeping masks", passing=True) as progress:
@@ -57,6 +55,6 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path, fit: Re
 
 
 def clear(folder: Path) -> None:
-    """Remove the files of another run in the same folder, later rounds too."""
+    """Remove the files of another run in the same folder."""
     for path in folder.glob("*"):
         shutil.rmtree(path) if path.is_dir() else path.unlink()

@@ -16,7 +16,7 @@ from beags_plugin.assignment.assignment import Assignment
 from beags_plugin.core.membership import Membership
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED, round_folder
+from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED
 from beags_plugin.plugin.runs.prepared import prepared_labels, read_grid
 from beags_plugin.plugin.runs.write import write_run
 from beags_plugin.plugin.training.contacts import close_contacts
@@ -47,9 +47,8 @@ class RefinementSwitch:
         self.ready = False  # to refine
         self._switching = False  # in the middle of the last base step, before nerfstudio evaluates and saves it
         self._evaluation_due = False
-        self._done: int | None = None  # host copy of refined_steps, which lies on the GPU
-        self.rounds = 0  # prepared so far, in this process and those that it resumes
-        model.prepared_rounds = 0
+        self.prepared = False  # in this process or one that it resumes
+        model.prepared = False
 
     @property
     def wanted(self) -> bool:
@@ -72,29 +71,24 @@ class RefinementSwitch:
         if self.refiner.joins_base and config.base_steps == 0:
             raise UserError("the refiner's option joint trains a base of its own: set base_steps, and load none.")
         if config.refine_steps > 0:
-            rounds, steps = config.refine_rounds, config.refine_steps
-            if not 1 <= rounds <= steps:
-                raise UserError(f"refine_rounds is {rounds}: it must be 1 to refine_steps, which is {steps}.")
-            if rounds > 1 and not self.refiner.trains:
-                raise UserError(f"refine_rounds is {rounds}: the refiner {config.refiner} has 1 round.")
             config.prepare.check()
             config.split.check()
         if config.refine_steps > 0 or self.refiner.joins_base:
             check_masks(view.labels for view in self.datamanager.views("train", original=True))
 
     def state(self) -> dict[str, Any]:
-        """Return the number of prepared rounds, and whether nerfstudio has evaluated the step; see ``Resumable``."""
+        """Return whether refinement is prepared, and nerfstudio has evaluated the step; see ``Resumable``."""
         own = self.model.own_training
         kept = {} if own is None else {"own": own.state(), "refiner": self._refiner_in_words()}
-        return {"rounds": self.rounds, "evaluated": not self._switching, **kept}
+        return {"prepared": self.prepared, "evaluated": not self._switching, **kept}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on in the round of ``state``."""
-        self.rounds = state["rounds"]
+        """Go on from ``state``."""
+        self.prepared = state["prepared"]
         self._evaluation_due = not state["evaluated"]
         self._own_state = state.get("own")
         now, began = self._refiner_in_words(), state.get("refiner")
-        if self.rounds > 0 and began != (None if self.refiner.leaves_base or self.refiner.trains else now):
+        if self.prepared and began != (None if self.refiner.leaves_base or self.refiner.trains else now):
             raise UserError(
                 f"refinement began with the refiner {began or 'bea or none'}, not with {now}: go on with that, or "
                 f"refine again from {BASE_SNAPSHOT}/nerfstudio_models."
@@ -113,13 +107,11 @@ class RefinementSwitch:
             self._join_base()
         if not self.wanted or not model.schedule.refining(step):
             return
-        done = self._done = int(model.refined_steps) if self._done is None else self._done
         if not self.ready:
-            self.rounds = max(self.rounds, sum(start < done for start in self._round_starts()))
-            if self.rounds > 0:
+            if self.prepared or int(model.refined_steps) > 0:
                 self._restore_files()
-        if sum(start <= done for start in self._round_starts()) > self.rounds:
-            self._prepare(step - 1)
+            else:
+                self._prepare(step - 1)
         if self._evaluation_due:
             self.trainer.eval_iteration(step - 1)
             self._evaluation_due = False
@@ -127,7 +119,6 @@ class RefinementSwitch:
             with self.trainer.long_stage(step - 1):
                 pass
         model.refined_steps += 1
-        self._done += 1
         if (own := model.own_training) is not None:
             self._edit(lambda: own.before_step(step - model.schedule.base_steps))
 
@@ -188,19 +179,16 @@ class RefinementSwitch:
                 style="yellow", highlight=False, markup=False, soft_wrap=True,
             )  # fmt: skip
 
-    def _round_starts(self) -> list[int]:
-        return self.model.schedule.round_starts(self.model.config.refine_rounds)
-
     def _prepare(self, step: int) -> None:
-        """Prepare a round from the scene as it is and the masks of the data. step: the last one done."""
-        model, first = self.model, self.rounds == 0
-        CONSOLE.rule("Preparing refinement" if first else "Preparing refinement again, with the refined depth")
+        """Prepare refinement from the scene as it is and the masks of the data. step: the last one done."""
+        model = self.model
+        CONSOLE.rule("Preparing refinement")
         start = time.perf_counter()
         with self.trainer.long_stage(step):
             views = self.datamanager.views("train", original=True)
             with bar("Reading masks", passing=True) as progress:
                 masks = LabelMaps(view.labels for view in counted(views, len(views), progress))
-            fit = residuals(model, views, masks) if first and self.datamanager.config.photos == "all" else None
+            fit = residuals(model, views, masks) if self.datamanager.config.photos == "all" else None
             with released(self.trainer.train_lock):  # minutes, which only read the scene: a viewer may render it
                 prepared = prepare(
                     model.surfels(),
@@ -220,22 +208,19 @@ class RefinementSwitch:
             for line in prepared.summary:
                 CONSOLE.print(f"  {line}", highlight=False, markup=False)
             self._take_classes(prepared.assignment)
-            if first:  # before save_prepared, whose last file marks everything as there
-                snapshot = self.trainer.base_dir / BASE_SNAPSHOT
-                write_run(self.trainer.config, snapshot, model.state_dict(), max(step, 0))
-                CONSOLE.print(f"  base kept in {snapshot}", highlight=False, markup=False, soft_wrap=True)
+            snapshot = self.trainer.base_dir / BASE_SNAPSHOT  # before save_prepared, whose last file marks all as there
+            write_run(self.trainer.config, snapshot, model.state_dict(), max(step, 0))
+            CONSOLE.print(f"  base kept in {snapshot}", highlight=False, markup=False, soft_wrap=True)
             if fit is not None and fit.contradict:
                 CONSOLE.print(fit.sentence(), style="yellow", highlight=False, markup=False, soft_wrap=True)
-            folder = round_folder(self.trainer.base_dir, self.rounds)
-            save_prepared(prepared, [view.name for view in views], folder, fit)
+            save_prepared(prepared, [view.name for view in views], self.trainer.base_dir / PREPARED, fit)
             if prepared.edited is not None:
                 edit_scene(model, self.trainer.optimizers.adam, prepared.edited.edited)
                 self._take_classes(prepared.edited.assignment)
             if prepared.members is not None:  # beyond the classes, which base/ keeps alone
                 model.take_members(prepared.members)
-            self.rounds += 1
             self._start(prepared.grid, prepared.labels)
-        self.trainer.seconds.prepared(prepared.seconds, time.perf_counter() - start, first)
+        self.trainer.seconds.prepared(prepared.seconds, time.perf_counter() - start)
 
     def _background_voxels(self) -> bool:
         return any(loss.asks_grid_about_background for loss in self.model.losses.values())
@@ -255,8 +240,7 @@ class RefinementSwitch:
         self.model.grid = None if grid is None else grid.to(self.model.device)
         own = self._own_training(self._scene(labels))
         self.model.frozen = own is None and not self.refiner.trains
-        self.model.prepared_rounds = self.rounds
-        self.ready = True
+        self.model.prepared = self.prepared = self.ready = True
 
     def _join_base(self) -> None:
         views = self.datamanager.views("train")
@@ -293,10 +277,10 @@ class RefinementSwitch:
 
     def _restore_files(self) -> None:
         """Read the masks and the grid of the run that the checkpoint came from, and copy them into this one."""
-        folder = round_folder(self.trainer.base_dir, self.rounds - 1)
+        folder = self.trainer.base_dir / PREPARED
         former = self.trainer.loaded_run
         if former is not None and former != self.trainer.base_dir:
-            clear(self.trainer.base_dir / PREPARED)
+            clear(folder)
             for name in (PREPARED, BASE_SNAPSHOT):
                 if (former / name).is_dir():
                     shutil.copytree(former / name, self.trainer.base_dir / name, dirs_exist_ok=True)

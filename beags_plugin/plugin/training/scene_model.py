@@ -51,8 +51,8 @@ class SceneModel(SplatfactoModel):
     classes: id to name. objects: see ``Membership``. step, seed: of the run. grid: voxels of the classes; None before
     refinement. growing: whether this step gathers gradients for densification. frozen: whether the refiner leaves the
     scene as it is. own_training: of a refiner that makes its steps itself. last_render: of the last training step.
-    measuring: whether anyone reads this step's metrics. prepared_rounds: rounds of refinement that this run has
-    prepared; None for a scene that is only looked at. exposures: of the training photos; None where they have one,
+    measuring: whether anyone reads this step's metrics. prepared: whether this run has prepared its
+    refinement; None for a scene that is only looked at. exposures: of the training photos; None where they have one,
     that of the scene. photo_colors: makes colours [N, 3] those that a training photo shows, by its index; None where
     they are the scene's. crop_box: nerfstudio's.
     """
@@ -96,7 +96,7 @@ class SceneModel(SplatfactoModel):
         self.last_render: LastRender | None = None
         self.clock = StepClock()
         self.measuring = True
-        self.prepared_rounds: int | None = None
+        self.prepared: bool | None = None
         self._known_extent: tuple[Tensor, int, float] | None = None
 
     # -- what is rendered, and how -----------------------------------------------------------------------------------

@@ -63,15 +63,10 @@ class StageSeconds:
         """Begin to count: the run trains from here on."""
         self._started = time.perf_counter()
 
-    def prepared(self, stages: dict[str, float], seconds: float, first: bool) -> None:
-        """Add a preparation of ``seconds``, with those of its stages; they do not count as refinement.
-
-        first: whether refinement begins here.
-        """
-        self._preparing += seconds
-        self._refining_since = time.perf_counter() if first else self._refining_since + seconds
-        names = {**self._stages, **stages}
-        self._stages = {name: self._stages.get(name, 0.0) + stages.get(name, 0.0) for name in names}
+    def prepared(self, stages: dict[str, float], seconds: float) -> None:
+        """Begin to count refinement, after a preparation of ``seconds``, with those of its stages."""
+        self._preparing, self._stages = seconds, dict(stages)
+        self._refining_since = time.perf_counter()
 
     def refining(self) -> None:
         """Begin to count refinement that another process has prepared."""

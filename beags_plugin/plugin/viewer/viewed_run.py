@@ -15,7 +15,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, prepared_digests, preparing_run, round_digest, round_folder
+from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, PREPARED, digest_of_prepared, files_digest, preparing_run
 from beags_plugin.plugin.runs.prepared import grid_state, read_grid
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.views import unique_names
@@ -43,25 +43,25 @@ class ViewedRun:
         self.cameras: list[Camera] = [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
         self.grid: VisibilityGrid | None = None
         self._before = lru_cache(_KEPT_MASKS)(datamanager.mask_labels)
-        self.rounds: Callable[[], int] = lambda: 1  # see ``prepared``
+        self.refining: Callable[[], bool] = lambda: True  # see ``prepared``
         self._after = lru_cache(_KEPT_MASKS)(_read_mask)
-        self._kept = prepared_digests(folder) if (folder / EXTRACTION_FILE).exists() else None
-        self._digest = lru_cache(1)(lambda folder, _changed: round_digest(folder))
+        self._kept = digest_of_prepared(folder) if (folder / EXTRACTION_FILE).exists() else None
+        self._digest = lru_cache(1)(lambda folder, _changed: files_digest(folder))
 
     @property
     def prepared(self) -> Path | None:
         """Return the folder that refinement was prepared with: of this run, or of its origin.
 
-        None while the shown scene has been through no preparation; else the folder of its last round: a folder that is
-        used again may hold rounds of a former run, and the origin of an extracted run may have been prepared again.
+        None while the shown scene has been through no preparation, as a folder that is used again may hold that of a
+        former run, and where the origin of an extracted run has been prepared again.
         """
-        folder = self._round()
+        folder = self._folder()
         return None if folder is None or self._replaced(folder) else folder
 
     @property
     def note(self) -> str | None:
         """Return a sentence for users where the files on disk are no longer those that this scene was prepared with."""
-        folder = self._round()
+        folder = self._folder()
         if folder is None or not self._replaced(folder):
             return None
         return (
@@ -69,23 +69,20 @@ class ViewedRun:
             "this was extracted from it. Extract it again."
         )
 
-    def _round(self) -> Path | None:
-        """Return the folder of the round, if it holds anything."""
-        rounds = self.rounds()
-        if rounds == 0:
-            return None
-        folder = round_folder(preparing_run(self.folder), rounds - 1)
-        return folder if (folder / "grid.pt").exists() else None
+    def _folder(self) -> Path | None:
+        """Return the folder of the preparation, if the scene has been through one and it holds anything."""
+        folder = preparing_run(self.folder) / PREPARED
+        return folder if self.refining() and (folder / "grid.pt").exists() else None
 
     def _replaced(self, folder: Path) -> bool:
-        """Return whether the round's folder has changed since this run was extracted, as far as that is known."""
+        """Return whether the folder has changed since this run was extracted, as far as that is known."""
         if self._kept is None:
             return False
         try:
             now = self._digest(folder, (folder / "grid.pt").stat().st_mtime_ns)
         except OSError:  # it is being replaced
             return True
-        return now != dict(enumerate(self._kept)).get(self.rounds() - 1)
+        return now != self._kept
 
     @property
     def has_grid(self) -> bool:

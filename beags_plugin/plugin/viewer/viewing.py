@@ -104,14 +104,9 @@ def class_outputs(model: SceneModel, scene: Visible, camera: Camera) -> dict[str
     return {"class_map": class_picture(classes), "class_confidence": share[..., None].float()}
 
 
-def rounds_of(model: SceneModel) -> int:
-    """Return the number of preparations of the scene as it now is; a checkpoint shows it by its steps."""
-    if model.prepared_rounds is not None:
-        return model.prepared_rounds
-    if not bool(model.assigned):
-        return 0
-    starts, done = model.schedule.round_starts(max(model.config.refine_rounds, 1)), int(model.refined_steps)
-    return max(1, sum(start < done for start in starts))
+def is_prepared(model: SceneModel) -> bool:
+    """Return whether the scene as it now is was prepared for refinement; a checkpoint shows it by its classes."""
+    return bool(model.assigned) if model.prepared is None else model.prepared
 
 
 def within(model: SceneModel, box: OrientedBox | None) -> Tensor | None:
@@ -161,7 +156,7 @@ class Viewing:
         the scene, or renders it for the viewer.
         """
         self.lock = lock or self.lock
-        run.rounds = lambda: rounds_of(self.model)
+        run.refining = lambda: is_prepared(self.model)
         classes = bool(self.model.assigned) or (training and self.model.schedule.refine_steps > 0)
         prepares = training and classes
         available = {

@@ -93,8 +93,8 @@ def test_a_scene_of_noise_is_closed_or_says_that_there_is_nothing_to_close(data,
 
 
 def test_a_refiner_that_trains_nothing_closes_nothing(data, tmp_path, three_faces):
-    run_to_end(short_config(data, tmp_path / "run", **CLOSE, **{"pipeline.model.refiner": "none",
-                            "pipeline.model.refine_steps": 1, "pipeline.model.refine_rounds": 1}))  # fmt: skip
+    changes = {"pipeline.model.refiner": "none", "pipeline.model.refine_steps": 1}
+    run_to_end(short_config(data, tmp_path / "run", **CLOSE, **changes))
     assert not three_faces
 
 

@@ -66,7 +66,6 @@ def refined(tmp_path_factory):
         settings = {
             "refiner": name,
             "refiner_options": options,
-            "refine_rounds": 1,
             "prepare.reprojection": "none",
             "start_from": root / "discs",
             "start_frame": "world",

@@ -108,7 +108,7 @@ def test_both_processes_have_the_same_scene_after_growth_and_refinement(two):
 @needs_gloo
 def test_both_processes_learn_the_same_codes(tmp_path):
     write_sample(tmp_path / "data", SampleConfig(seed=3, width=48, height=36, num_train=7, num_test=2))
-    changes = {"refiner": "gaussian-grouping", "refine_rounds": 1, "prepare.reprojection": "none"}
+    changes = {"refiner": "gaussian-grouping", "prepare.reprojection": "none"}
     train_in_two(tmp_path / "data", tmp_path, **{f"pipeline.model.{name}": value for name, value in changes.items()})
     first, second = (json.loads((tmp_path / f"rank{rank}.json").read_text())["end"] for rank in (0, 1))
     for name in ("own", "_model.gauss_params.means", "_model.class_ids"):

@@ -49,14 +49,14 @@ def whole(short_run):
     return short_run / "run"
 
 
-def test_the_run_grows_splits_and_prepares_twice(whole):
+def test_the_run_grows_splits_and_prepares(whole):
     saved = checkpoint_of(whole)
     assert saved["step"] == LAST and int(saved["pipeline"]["_model.refined_steps"]) == STEPS[1]
     base = torch.load(next((whole / "base/nerfstudio_models").iterdir()), weights_only=True)["pipeline"]
     assert len(saved["pipeline"]["_model.gauss_params.means"]) > len(base["_model.gauss_params.means"])
     grown = [record["gaussians"] for record in json.loads((whole / "held_out.json").read_text())]
     assert len(set(grown)) > 2
-    assert saved["beags"]["parts"]["refinement"] == {"rounds": 2, "evaluated": True}
+    assert saved["beags"]["parts"]["refinement"] == {"prepared": True, "evaluated": True}
 
 
 # after growth, in the last base step, in the first step of refinement; elsewhere in the test of many kills
@@ -90,17 +90,11 @@ def stage_module(name):
     return bea if name == "build_visibility_grid" else preparation
 
 
-@pytest.mark.parametrize(("name", "round_"), [*((name, 1) for name in STAGES), ("contributions", 2)])
-def test_a_kill_in_the_preparation_ends_as_the_whole_one(data, whole, tmp_path, monkeypatch, name, round_):
+@pytest.mark.parametrize("name", STAGES)
+def test_a_kill_in_the_preparation_ends_as_the_whole_one(data, whole, tmp_path, monkeypatch, name):
     """The preparation that was interrupted is made again, from the scene that was saved before it."""
-    run, calls = tmp_path / "run", []
-    compute = getattr(stage_module(name), name)
-
-    def stage(*args, **options):
-        calls.append(name)
-        return killed() if len(calls) == round_ else compute(*args, **options)
-
-    interrupted(data, run, monkeypatch, lambda patch: patch.setattr(stage_module(name), name, stage))
+    run = tmp_path / "run"
+    interrupted(data, run, monkeypatch, lambda patch: patch.setattr(stage_module(name), name, killed))
     resume_to_end(run)
     assert_same_run(run, whole)
 
@@ -160,12 +154,12 @@ def test_refinement_of_a_loaded_base_is_resumed(data, whole, tmp_path, monkeypat
     assert differences(*(without_clocks(checkpoint_of(run)) for run in runs)) == []
 
 
-def test_another_run_into_the_folder_leaves_no_round_of_the_former(data, tmp_path):
-    run = tmp_path / "run"
-    run_to_end(short_config(data, run))
-    assert (run / "prepared" / "round_2").is_dir()
-    run_to_end(short_config(data, run, **{"pipeline.model.refine_rounds": 1}))
-    assert (run / "prepared" / "masks").is_dir() and not (run / "prepared" / "round_2").exists()
+def test_another_run_into_the_folder_leaves_no_mask_of_the_former(data, tmp_path):
+    former = tmp_path / "run/prepared/masks/former.png"
+    former.parent.mkdir(parents=True)
+    former.touch()
+    run_to_end(short_config(data, tmp_path / "run"))
+    assert list(former.parent.iterdir()) and not former.exists()
 
 
 def test_a_run_of_a_gpu_goes_on_without_one_if_asked(data, tmp_path, monkeypatch):

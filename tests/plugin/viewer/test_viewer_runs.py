@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from run_folders import write_prepared, write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
@@ -19,7 +18,6 @@ from viewer_windows import ALWAYS, Stand, write_finished
 
 from beags_plugin.labels.classes import write_mask
 from beags_plugin.plugin.objects.extract import extract_objects
-from beags_plugin.plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.viewer.viewing import CHANNELS
 from beags_plugin.system.errors import UserError
 
@@ -47,7 +45,7 @@ def test_masks_of_a_former_run_in_the_folder_are_not_shown_while_a_base_is_train
     run = window.model.viewing.run
     assert run.mask(0, "before", 20, 12) is not None and run.mask(0, "after", 20, 12) is None
     assert not run.has_grid and not run.load_grid()
-    window.model.prepared_rounds = 1  # as the switch to refinement says once it is done
+    window.model.prepared = True  # as the switch to refinement says once it is done
     first = run.mask(0, "after", 20, 12)
     path = tmp_path / "run/prepared/masks" / f"{run.names[0]}.png"
     write_mask(path, np.zeros((12, 20), np.uint8))  # prepared again
@@ -63,23 +61,6 @@ def test_a_base_opened_again_shows_no_masks_of_a_former_run_in_its_folder(tmp_pa
     run = window.model.viewing.run
     assert run.mask(0, "after", 20, 12) is None and not run.has_grid and not run.load_grid()
     assert set(window.look()) == ALWAYS | {"mask_before"}
-
-
-@pytest.mark.parametrize(("done", "masks"), [(0, 0), (1, 0), (3, 0), (4, 2), (6, 2)])
-def test_only_rounds_that_the_scene_has_been_through_are_shown(tmp_path, done, masks):
-    """Three rounds of nine steps are prepared before steps 0, 3 and 6; this run has come to step 6, and a former run
-    in its folder had another round."""
-    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
-    for folder, shift in (("", 0), ("round_2", 2), ("round_3", 3)):
-        write_prepared(tmp_path / "run", shift, folder)
-
-    def change(model):
-        model.config.refine_rounds, model.schedule = 3, PhaseSchedule(10, 9)
-        model.refined_steps.fill_(done)
-
-    run = Stand(config, change=change).model.viewing.run
-    before, after = (run.mask(0, kind, 20, 12) for kind in ("before", "after"))
-    assert torch.equal(before.roll(masks, 0), after)
 
 
 def test_an_extracted_run_shows_its_object_and_the_masks_of_the_run_it_is_from(finished, tmp_path):
@@ -129,7 +110,7 @@ def test_an_extracted_run_without_digests_shows_masks_and_one_without_its_origin
     (extracted,) = extract_objects(finished, ["cup"], output=tmp_path / "out")
     origin = extracted.config.parent / "extraction.json"
     content = json.loads(origin.read_text())
-    assert len(content["prepared"]) == 1
+    assert content["prepared"]
     origin.write_text(json.dumps({**content, "run": str(tmp_path / "gone/config.yml")}))
     listed = set(Stand(extracted.config).look())
     assert listed == ALWAYS | {"class_map", "class_confidence", "boundary_error", "mask_before"}
