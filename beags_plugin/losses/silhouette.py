@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.lifting import lift
+from beags_plugin.labels.borders import at_border
 from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.losses.base import Loss, LossInputs
-from beags_plugin.losses.boundary import beyond_slack
 from beags_plugin.losses.class_members import ClassMembers
 from beags_plugin.losses.reduction import ordered_sum
 from beags_plugin.rasterizers.rendering import shape_inputs
@@ -30,12 +30,12 @@ EDGE = 3
 """Voxels of the 27 around a point that a plane fills which ends one voxel before it; up to its edge it fills 6."""
 
 SLACK = 0.4
-"""Of a pixel next to another class, which may be covered in part; as in the boundary loss of our presets."""
+"""Of a pixel next to another class, which shows both: so much of it may be covered."""
 
 
 @dataclass(frozen=True)
 class SilhouetteLoss(Loss):
-    """Mean over the labelled pixels of A_c where M' != c, beyond ``SLACK`` at borders, summed over the view's objects c.
+    """Mean over the labelled pixels of A_c where M' != c, beyond ``SLACK`` at borders, summed over the view's objects.
 
     A_c is the alpha of the Gaussians of class c rendered alone. Where the object lies behind what the whole scene
     shows, it may be hidden rightly, and the pixel does not count.
@@ -94,7 +94,7 @@ class SilhouetteLoss(Loss):
         if self.seen > 0:
             of_others = outside & (inputs.labels != 0) & (alone.alpha.detach() > 0) & (depth > shown)
             outside &= ~self._own_surface(of_others, depth, class_id, inputs)
-        return ordered_sum(beyond_slack(torch.where(outside, alone.alpha, 0.0), inputs.labels, SLACK))
+        return ordered_sum(beyond_slack(torch.where(outside, alone.alpha, 0.0), inputs.labels))
 
     def _own_surface(self, asked: Tensor, depth: Tensor, class_id: int, inputs: LossInputs) -> Tensor:
         """Return the pixels of ``asked`` at whose ``depth`` [H, W] the object's surface goes on, both [H, W] bool."""
@@ -106,6 +106,11 @@ class SilhouetteLoss(Loss):
         others = torch.where(asked, inputs.labels, IGNORE).int().reshape(-1)
         own, other = inputs.grid.count(points, ids), inputs.grid.count(points, others)
         return ((own >= self.seen) | (own >= other.clamp_min(EDGE))).view_as(asked)
+
+
+def beyond_slack(wrong: Tensor, labels: Tensor) -> Tensor:
+    """Return ``wrong`` [H, W], at pixels next to another class what exceeds ``SLACK``. labels: [H, W] int, M'."""
+    return torch.where(at_border(labels), (wrong - SLACK).clamp_min(0.0), wrong)
 
 
 def _chosen(count: int, wanted: int, seed: int, step: int) -> list[int]:

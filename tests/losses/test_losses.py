@@ -18,7 +18,6 @@ from beags_plugin.losses.distortion import DistortionLoss
 from beags_plugin.losses.normal import NormalConsistencyLoss, depth_normals
 from beags_plugin.losses.photometric import PhotometricLoss, blur, ssim, ssim_map
 from beags_plugin.losses.reduction import grouped_sums, ordered_linear, ordered_mean, ordered_outer_sum, ordered_sum
-from beags_plugin.system.errors import UserError
 
 
 def _inputs(camera=None, image=None, labels=None, **render) -> LossInputs:
@@ -246,17 +245,6 @@ def test_an_image_too_small_for_differences():
 def test_distortion_is_the_mean():
     image = _random(4, 5)
     assert float(DistortionLoss().value(_inputs(distortion=image))) == pytest.approx(float(image.mean()))
-
-
-def test_boundary_slack_forgives_a_part_of_mixed_pixels_alone():
-    labels = torch.tensor([[1, 1, 1, 0, 0, 0]] * 3, dtype=torch.int32)
-    boundary = torch.tensor([[0.3, 0.3, 0.3, 0.6, 0.3, 0.3]] * 3, requires_grad=True)
-    value = BoundaryLoss(slack=0.4).value(_inputs(labels=labels, boundary=boundary))
-    assert value.item() == pytest.approx((4 * 0.3 + 0.2) / 6)
-    value.backward()
-    assert torch.equal(boundary.grad[0] > 0, torch.tensor([True, True, False, True, True, True]))
-    with pytest.raises(UserError, match="slack = 1.0"):
-        BoundaryLoss(slack=1.0)
 
 
 def test_boundary_is_the_mean_over_labelled_pixels():

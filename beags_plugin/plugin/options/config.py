@@ -165,7 +165,7 @@ def base_config() -> BeagsTrainerConfig:
                     "photometric": LossSpec(),
                     "distortion": LossSpec(weight=0.0, start=3_000),
                     "normal": LossSpec(weight=0.05, start=7_000),
-                    "boundary": LossSpec(weight=0.5, phase="refine", options={"slack": 0.0}),
+                    "boundary": LossSpec(weight=0.5, phase="refine"),
                     "silhouette": LossSpec(weight=0.0, phase="refine", options={"objects": 1, "seen": 0}),
                     "occupancy": LossSpec(weight=10.0, phase="refine", options={"samples": 20, "background": 1.0}),
                 },

@@ -28,8 +28,7 @@ class LossSpec:
     """First step of the term: of the run, stated for a base of schedule_steps; or, for phase "refine", of the
     refinement, as it is."""
     options: dict[str, bool | int | float] = field(default_factory=dict)
-    """Of the loss itself. boundary: slack, how much of another class costs nothing at pixels next to it, 0 as in the
-    paper. occupancy: samples, points per Gaussian and step (Z); background, the share of the weight on
+    """Of the loss itself. occupancy: samples, points per Gaussian and step (Z); background, the share of the weight on
     the background's Gaussians, 1 as in the paper. silhouette: objects, how many are rendered each step; seen, of the 27
     voxels around what another object covers how many seen as the object's own make that pixel not count, 0 for never.
     """
