@@ -14,7 +14,7 @@ from beags_plugin.evaluation.records import IMAGE_FIGURES
 from beags_plugin.evaluation.report import STAGES as MOMENTS
 from beags_plugin.evaluation.table import protocol_sentence
 
-STAGES = ("base training", "reprojection", "assignment", "border split", "voxel grids", "objects", "refinement")
+STAGES = ("base training", "reprojection", "assignment", "voxel grids", "objects", "refinement")
 MEAN = "mean"  # in the column "object": over all masks of the scene
 _PLACE = ("scene", "seed", "variant", "sweep", "line", "x", "object", "failed")
 _COSTS = ("cpu_seconds", "peak_memory_mb", "own_memory_mb", "steps", "gaussians")

@@ -170,7 +170,7 @@ def split_by_sampling(surfels: Surfels, chosen: Tensor, generator: torch.Generat
     """Replace each chosen surfel by two, placed by its own Gaussian and smaller by ``SPLIT_SHRINK``; else its copies.
 
     surfels: N surfels without gradients. chosen: [N] bool. The others keep their order; the halves follow them. This
-    is the split of densification; ``core.splitting.split_in_two`` changes less of what is seen.
+    is the split of densification.
     """
     return _grow(surfels, torch.zeros_like(chosen), chosen, generator)
 

@@ -20,7 +20,6 @@ from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.preparation.border_split import BorderSplitConfig, split_at_borders
 from beags_plugin.preparation.consistent_masks import (
     AUTO,
     ConsistentMasks,
@@ -30,8 +29,8 @@ from beags_plugin.preparation.consistent_masks import (
     render_depths,
     reprojected_masks,
 )
-from beags_plugin.preparation.refiner import AssignedScene, EditedScene, Refiner
-from beags_plugin.preparation.summary import assignment_summary, reprojection_summary, split_summary
+from beags_plugin.preparation.refiner import AssignedScene, Refiner
+from beags_plugin.preparation.summary import assignment_summary, reprojection_summary
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import check_surface_depth
 from beags_plugin.system.errors import UserError
@@ -91,7 +90,6 @@ class Preparation:
     labels, confidence: per training view, see ``ConsistentMasks``.
     assignment: classes of the base.
     grid: the visibility voxel grids, or None if the refiner needs none.
-    edited: start of refinement if Gaussians were split; None if it starts from the base.
     members: the objects, where the refiner says more than the classes do.
     summary: a line of text per stage. seconds: wall time per stage.
     """
@@ -100,7 +98,6 @@ class Preparation:
     confidence: CompressedMaps | None
     assignment: Assignment
     grid: VisibilityGrid | None
-    edited: EditedScene | None = None
     members: Membership | None = None
     summary: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
@@ -115,13 +112,12 @@ def prepare(
     settings: RasterSettings,
     refiner: Refiner,
     config: PreparationConfig,
-    split: BorderSplitConfig | None = None,
     background_voxels: bool = True,
     seed: int = 0,
     scale: float = 1.0,
     stage: Stage = lambda name: nullcontext(),
 ) -> Preparation:
-    """Make labels consistent, assign classes, split at boundaries if the refiner trains, build the voxel grids.
+    """Make labels consistent, assign classes, build the voxel grids.
 
     surfels: the trained base, N Gaussians.
     cameras: V training views; labels: per view [H, W] int32 class ids or IGNORE, or None; held as ``LabelMaps``.
@@ -141,26 +137,15 @@ def prepare(
 
     with _timed("reprojection", seconds):
         masks = _consistent_masks(surfels, cameras, maps, known, rasterizer, settings, config, stage, summary)
-    ranked = masks.ranked
-
     with _timed("assignment", seconds), stage("Assigning classes") as progress:
-        shares = contributions(surfels, cameras, ranked, rasterizer, settings, len(known), progress=progress)
+        shares = contributions(surfels, cameras, masks.ranked, rasterizer, settings, len(known), progress=progress)
         shares = replace(shares, classes=known)
         assignment = by_largest(shares)
     summary.append(assignment_summary(assignment, class_names))
 
-    edited = None
-    if split is not None and split.rounds > 0 and refiner.trains:
-        with _timed("border split", seconds), stage("Splitting Gaussians at borders") as progress:
-            divided = split_at_borders(surfels, cameras, ranked, rasterizer, settings, len(known), split, progress)
-        summary.append(split_summary(len(surfels), divided))
-        classes = replace(divided.assignment, class_ids=known.class_ids(divided.assignment.class_ids))
-        edited, surfels = replace(divided, assignment=classes), divided.edited.surfels
-
-    class_ids = (assignment if edited is None else edited.assignment).class_ids
     scene = AssignedScene(
         surfels,
-        class_ids,
+        assignment.class_ids,
         cameras,
         masks.labels,
         max(class_names) + 1,
@@ -181,14 +166,14 @@ def prepare(
     with stage("Building voxel grids") as progress:
         grid = refiner.build_grid(scene, k, progress)
     if grid is not None:
-        asked = torch.unique(class_ids)  # classes are fixed: no loss asks about one without Gaussians
+        asked = torch.unique(assignment.class_ids)  # classes are fixed: no loss asks about one without Gaussians
         grid = grid.only(asked if background_voxels else asked[asked != 0])
         seconds["voxel grids"] = time.perf_counter() - start
         summary.append(f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {k})")
     start = time.perf_counter()
     if (members := refiner.members(scene)) is not None:
         seconds["objects"] = time.perf_counter() - start
-    return Preparation(masks.labels, masks.confidence, assignment, grid, edited, members, summary, seconds)
+    return Preparation(masks.labels, masks.confidence, assignment, grid, members, summary, seconds)
 
 
 def check_masks(labels: Iterable[Tensor | None]) -> None:

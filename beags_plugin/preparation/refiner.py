@@ -8,10 +8,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from beags_plugin.assignment.assignment import Assignment
 from beags_plugin.assignment.contributions import Contributions
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.densification import Densified
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.occupancy.grid import VisibilityGrid
@@ -49,17 +47,6 @@ class AssignedScene:
     unseen: bool = False
     votes: bool = False
     stage: Stage = lambda title: nullcontext()
-
-
-@dataclass(frozen=True)
-class EditedScene:
-    """A scene of M Gaussians, some of them split before refinement, and their classes.
-
-    edited: the Gaussians, of each the index [M] of its source and whether it is new [M] bool.
-    """
-
-    edited: Densified
-    assignment: Assignment
 
 
 @dataclass(frozen=True)

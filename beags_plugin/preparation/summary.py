@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from beags_plugin.assignment.assignment import Assignment
-from beags_plugin.preparation.refiner import EditedScene
 
 
 def reprojection_summary(before: Sequence[Tensor | None], after: Sequence[Tensor]) -> str:
@@ -23,12 +22,6 @@ def reprojection_summary(before: Sequence[Tensor | None], after: Sequence[Tensor
         f"reprojection: {changed} of {pixels} labelled pixels changed ({100 * changed / max(pixels, 1):.2f} %), "
         f"{filled} views without a mask got one"
     )
-
-
-def split_summary(before: int, divided: EditedScene) -> str:
-    """Describe the number of split Gaussians."""
-    after = len(divided.edited.surfels)
-    return f"border split: {int(divided.edited.fresh.sum())} halves, {before} Gaussians became {after}"
 
 
 def assignment_summary(assignment: Assignment, class_names: dict[int, str]) -> str:

@@ -295,14 +295,14 @@ def test_rows_refine_as_the_presets_that_they_name():
     assert replace(own, exposure="off", prepare=replace(own.prepare, k_pixels=0)) == paper
     assert own.exposure == "auto" and own.prepare.k_pixels == 120_000_000
     assert (own.refine_steps, own.losses["boundary"].weight, own.losses["occupancy"].weight) == (3000, 0.5, 10.0)
-    assert (own.split.rounds, own.prepare.unseen, own.losses["silhouette"].weight) == (0, False, 0.0)
+    assert (own.prepare.unseen, own.losses["silhouette"].weight) == (False, 0.0)
     for name in ("beags-refine", "beags-fast"):
         assert models[name] == preset_config(name, {MODEL + "base_steps": 0}, Path()).model_config
     for name, variant in by_name.items():
         assert ("neither loss" in name) == (not any(loss.weight for loss in _of_masks(models[name])))
         if variant.control is not None:
             control = models[variant.control]
-            for key in ("refine_steps", "refine_position_lr_factor", "split"):
+            for key in ("refine_steps", "refine_position_lr_factor"):
                 assert getattr(control, key) == getattr(models[name], key)
     assert [name for name, variant in by_name.items() if variant.control is None and "loss" not in name] == [
         "assignment alone"

@@ -61,7 +61,7 @@ def test_training_reports_its_stages(trained):
     assert (folder / "config.yml").exists()
     assert sorted(path.name for path in (folder / "nerfstudio_models").iterdir()) == ["step-000000259.ckpt"]
     report = json.loads((folder / "prepared" / "report.json").read_text())
-    assert set(report["seconds"]) == {"reprojection", "assignment", "border split", "voxel grids"}
+    assert set(report["seconds"]) == {"reprojection", "assignment", "voxel grids"}
 
 
 def test_each_loss_has_its_own_curve(trained):

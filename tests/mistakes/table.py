@@ -25,7 +25,7 @@ Command = Callable[[], None]
 TRAINED = "trained"  # the folder of the run that ``Place.train`` begins
 SHORT = (
     *("--pipeline.model.base-steps", "4", "--pipeline.model.refine-steps", "2", "--pipeline.model.prepare.k", "5"),
-    *("--pipeline.model.split.rounds", "0", "--pipeline.model.prepare.reprojection", "voxel"),
+    *("--pipeline.model.prepare.reprojection", "voxel"),
 )
 """Flags of ns-train for a run that comes through all its phases in a second."""
 

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import json
-from contextlib import contextmanager
 from pathlib import Path
-from unittest import mock
 
 import pytest
 import torch
-
-from beags_plugin.preparation import border_split
 
 STEPS = 45, 12  # of base and refinement
 
@@ -52,23 +48,14 @@ def run_to_end(config):
     """Train as ns-train does."""
     from beags_plugin.plugin.runs.launch import train
 
-    with splits():
-        train(config)
+    train(config)
 
 
 def resume_to_end(run: Path, device: str | None = None):
     """Resume a run as ``beags resume`` does."""
     from beags_plugin.plugin.runs.launch import resume
 
-    with splits():
-        resume(run, device)
-
-
-@contextmanager
-def splits():
-    """Let the border split find Gaussians in a scene as small as this."""
-    with mock.patch.object(border_split, "MIN_SHARE", 0.05), mock.patch.object(border_split, "MIN_SIGMA", 0.1):
-        yield
+    resume(run, device)
 
 
 def checkpoint_of(run: Path) -> dict:

@@ -17,7 +17,6 @@ from beags_plugin.core.sh import MAX_DEGREE
 from beags_plugin.plugin.options.loss_spec import LossSpec
 from beags_plugin.plugin.options.pyramid import PyramidConfig
 from beags_plugin.plugin.options.schedule import PhaseSchedule
-from beags_plugin.preparation.border_split import BorderSplitConfig
 from beags_plugin.preparation.pipeline import PreparationConfig
 from beags_plugin.refiners import make_refiner
 from beags_plugin.system.errors import UserError
@@ -75,8 +74,6 @@ class BeagsModelConfig(ModelConfig):
     """Small photos first, in the base."""
     prepare: PreparationConfig = field(default_factory=PreparationConfig)
     """Options of mask reprojection and of the voxel grids."""
-    split: BorderSplitConfig = field(default_factory=BorderSplitConfig)
-    """Which Gaussians at class borders are split before refinement; none unless rounds is 1 or more."""
     position_lr: Suppress[tuple[float, float]] = (1.6e-4, 1.6e-6)
     """First and last learning rate of the positions, log-linear, times the scene's extent."""
     base_lr_factor: float = 1.0

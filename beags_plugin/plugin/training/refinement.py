@@ -23,7 +23,7 @@ from beags_plugin.plugin.training.contacts import close_contacts
 from beags_plugin.plugin.training.contradiction import residuals
 from beags_plugin.plugin.training.prepared_files import bar, clear, save_prepared
 from beags_plugin.plugin.training.resumable import TrainingRun
-from beags_plugin.plugin.training.scene_edits import apply_edit, edit_scene
+from beags_plugin.plugin.training.scene_edits import apply_edit
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.preparation.own_training import Edit, OwnTraining, TrainedScene
@@ -72,7 +72,6 @@ class RefinementSwitch:
             raise UserError("the refiner's option joint trains a base of its own: set base_steps, and load none.")
         if config.refine_steps > 0:
             config.prepare.check()
-            config.split.check()
         if config.refine_steps > 0 or self.refiner.joins_base:
             check_masks(view.labels for view in self.datamanager.views("train", original=True))
 
@@ -199,7 +198,6 @@ class RefinementSwitch:
                     model.settings(),
                     self.refiner,
                     model.config.prepare,
-                    model.config.split,
                     background_voxels=self._background_voxels(),
                     seed=model.seed,
                     scale=self._scale(),
@@ -214,9 +212,6 @@ class RefinementSwitch:
             if fit is not None and fit.contradict:
                 CONSOLE.print(fit.sentence(), style="yellow", highlight=False, markup=False, soft_wrap=True)
             save_prepared(prepared, [view.name for view in views], self.trainer.base_dir / PREPARED, fit)
-            if prepared.edited is not None:
-                edit_scene(model, self.trainer.optimizers.adam, prepared.edited.edited)
-                self._take_classes(prepared.edited.assignment)
             if prepared.members is not None:  # beyond the classes, which base/ keeps alone
                 model.take_members(prepared.members)
             self._start(prepared.grid, prepared.labels)

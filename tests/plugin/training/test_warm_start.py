@@ -145,7 +145,7 @@ def test_refinement_starts_from_a_ply_and_does_not_need_it_later(scene, tmp_path
 
     ply, run = tmp_path / "scene.ply", tmp_path / "run"
     write_ply(ply, scene.surfels, layout="2dgs")
-    config = config_of(scene, run, refine_steps=2, start_from=ply, **{"split.rounds": 0})
+    config = config_of(scene, run, refine_steps=2, start_from=ply)
     config.model_config.prepare = type(config.model_config.prepare)(k=5)
     train(config)
     ply.unlink()
