@@ -13,7 +13,6 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import lift
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.occupancy.unseen import with_unseen
 from beags_plugin.occupancy.voxel_size import reference_indices, voxel_size_of_reference
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, render_class_map, surface_depth
@@ -71,14 +70,13 @@ def build_visibility_grid(
     seed: int = 0,
     depth: str = "median",
     progress: Callable[[int, int], None] | None = None,
-    unseen: bool = False,
     votes: bool = False,
 ) -> VisibilityGrid:
     """Render depth and class of every view, lift the pixels with A >= 0.5, and voxelise them per class.
 
     surfels: N Gaussians. class_ids: [N] int32, phi, below ``num_classes``.
     k: sets the voxel size (E8); seed: of the points that measure it. depth: the lifted depth (``surface_depth``).
-    unseen: whether unseen voxels are added (``with_unseen``). votes: whether views vote (``Sightings.by_votes``).
+    votes: whether views vote (``Sightings.by_votes``).
     Solid pixels lie in a temporary file (6 bytes each for up to 256 class ids), read twice, view by view: memory grows
     with the voxels and with the points that measure their size.
     Raises ``UserError`` if no pixel of any view reaches an alpha of 0.5.
@@ -95,8 +93,7 @@ def build_visibility_grid(
     size = voxel_size_of_reference(reference, total, k, seed)
     origin = torch.from_numpy(reference.min(0).astype(np.float64)).to(surfels.means.device)
     clouds = ((view.points(), view.class_id) for view in views)
-    grid = VisibilityGrid.from_points(clouds, size, origin, num_classes, votes=votes)
-    return with_unseen(grid, surfels, class_ids, views) if unseen else grid
+    return VisibilityGrid.from_points(clouds, size, origin, num_classes, votes=votes)
 
 
 def _render(surfels, class_ids, camera, rasterizer, settings, num_classes: int, depth: str) -> _View:

@@ -30,8 +30,7 @@ class VisibilityGrid:
 
     voxel_size: world units. origin: [3] float64, corner of voxel (0, 0, 0), world. num_classes: ids lie below it;
         memory and speed depend on the number of classes with voxels.
-    keys: [M] int64, sorted: the occupied voxels, 21 bits per axis. classes: [M] int32, the class of each. A voxel that
-        supports several classes comes once for each.
+    keys: [M] int64, sorted: the occupied voxels, 21 bits per axis. classes: [M] int32, the class of each.
     dense_bytes: see ``DENSE_BYTES``; 0 forces sorted keys. It affects the speed of ``valid`` without the extension.
     """
 
@@ -83,14 +82,6 @@ class VisibilityGrid:
         return VisibilityGrid(
             self.voxel_size, self.origin, self.num_classes, self.keys[kept], self.classes[kept], self._dense_bytes
         )
-
-    def near(self, points: Tensor) -> Tensor:
-        """Return [P] bool, whether points [P, 3] lie where voxels have keys."""
-        return (_scaled(points, self.origin, self.voxel_size).abs() < _HALF).all(-1)
-
-    def keys_of(self, points: Tensor) -> Tensor:
-        """Return [P] int64, the key of the voxel around each point [P, 3]; raises ``UserError`` far away."""
-        return _pack(_voxels(points, self.origin, self.voxel_size))
 
     def centres(self, keys: Tensor) -> Tensor:
         """Return [M, 3] float32, world, the centres of voxels by their keys [M]."""

@@ -52,9 +52,6 @@ class PreparationConfig:
     """Which depth is lifted: median or expected."""
     k: int = 2000
     """Neighbours that set the voxel size (E8); more make larger voxels."""
-    unseen: bool = False
-    """Whether space that no view has seen supports what it lies in: the object around it, else the background. In the
-    paper it supports nothing."""
     votes: bool = False
     """Whether a voxel supports the class that most views saw in it, an object if two did. In the paper it supports no
     class where several were seen, and one view is enough."""
@@ -156,7 +153,6 @@ def prepare(
         shares,
         scale,
         config.depth,
-        config.unseen,
         config.votes,
         stage,
     )

@@ -29,6 +29,5 @@ class BeaRefiner(Refiner):
             seed=scene.seed,
             depth=scene.depth,
             progress=progress,
-            unseen=scene.unseen,
             votes=scene.votes,
         )

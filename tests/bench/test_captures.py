@@ -295,7 +295,7 @@ def test_rows_refine_as_the_presets_that_they_name():
     assert replace(own, exposure="off", prepare=replace(own.prepare, k_pixels=0)) == paper
     assert own.exposure == "auto" and own.prepare.k_pixels == 120_000_000
     assert (own.refine_steps, own.losses["boundary"].weight, own.losses["occupancy"].weight) == (3000, 0.5, 10.0)
-    assert (own.prepare.unseen, own.losses["silhouette"].weight) == (False, 0.0)
+    assert own.losses["silhouette"].weight == 0.0
     for name in ("beags-refine", "beags-fast"):
         assert models[name] == preset_config(name, {MODEL + "base_steps": 0}, Path()).model_config
     for name, variant in by_name.items():
