@@ -64,7 +64,7 @@ SHIPPED = {
     "sensitivity": "How much the result depends on k (neighbours that set the voxel size) and Z (samples per "
     "Gaussian).",
     "depth": "How much refinement needs of the base's depth: bases trained with and without depth and normal terms.",
-    "occupancy": "What the occupancy loss does to the background and to contacts, with the paper's grid and with ours.",
+    "occupancy": "What the occupancy loss does, by the share of its weight on the background.",
     "masks": "How much damage to the masks costs, with and without reprojection.",
     "tradeoff": "What time and memory buy: every choice moved alone, and the Pareto front of cost and quality.",
     "presets": "What the refinements of the presets cost and give, from one base.",

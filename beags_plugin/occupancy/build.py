@@ -70,13 +70,11 @@ def build_visibility_grid(
     seed: int = 0,
     depth: str = "median",
     progress: Callable[[int, int], None] | None = None,
-    votes: bool = False,
 ) -> VisibilityGrid:
     """Render depth and class of every view, lift the pixels with A >= 0.5, and voxelise them per class.
 
     surfels: N Gaussians. class_ids: [N] int32, phi, below ``num_classes``.
     k: sets the voxel size (E8); seed: of the points that measure it. depth: the lifted depth (``surface_depth``).
-    votes: whether views vote (``Sightings.by_votes``).
     Solid pixels lie in a temporary file (6 bytes each for up to 256 class ids), read twice, view by view: memory grows
     with the voxels and with the points that measure their size.
     Raises ``UserError`` if no pixel of any view reaches an alpha of 0.5.
@@ -93,7 +91,7 @@ def build_visibility_grid(
     size = voxel_size_of_reference(reference, total, k, seed)
     origin = torch.from_numpy(reference.min(0).astype(np.float64)).to(surfels.means.device)
     clouds = ((view.points(), view.class_id) for view in views)
-    return VisibilityGrid.from_points(clouds, size, origin, num_classes, votes=votes)
+    return VisibilityGrid.from_points(clouds, size, origin, num_classes)
 
 
 def _render(surfels, class_ids, camera, rasterizer, settings, num_classes: int, depth: str) -> _View:

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
-from beags_plugin.occupancy.support import Sightings
 from beags_plugin.ops import cuda_extension, extension
 from beags_plugin.ops.voxel_lookup import VoxelLookup
 from beags_plugin.ops.voxel_tally import VoxelTally
@@ -23,7 +22,7 @@ _HALF = 1 << (_BITS - 1)
 
 
 class VisibilityGrid:
-    """The voxels that support each class: in the paper those that hold lifted points of this class alone.
+    """The voxels that support each class: those that hold lifted points of this class alone.
 
     D_occ(x, V_phi) is the number of occupied voxels of V_phi among the 27 around x. An empty grid, of a class that is
     never seen or collides everywhere, has D_occ = 0: all of the class is penalised.
@@ -51,12 +50,11 @@ class VisibilityGrid:
     @classmethod
     def from_points(
         cls, clouds: Iterable[tuple[Tensor, Tensor]], voxel_size: float, origin: Tensor, num_classes: int,
-        dense_bytes: int = DENSE_BYTES, votes: bool = False,
+        dense_bytes: int = DENSE_BYTES,
     ) -> VisibilityGrid:  # fmt: skip
         """Build the grid of lifted points; a voxel in which classes collide is empty in all (method, section 5).
 
         clouds: pairs (points [P, 3] float, class_ids [P] int), read one by one, one per view.
-        votes: whether the views vote instead (``Sightings.by_votes``).
         Raises ``UserError`` if the cloud spans more than 2^21 voxels along an axis.
         """
         origin = origin.to(torch.float64)
@@ -64,17 +62,21 @@ class VisibilityGrid:
         first = next(clouds, None)
         if first is not None:
             clouds = itertools.chain([first], clouds)
-            if not votes and (module := cuda_extension.module_for(first[0])) is not None:
+            if (module := cuda_extension.module_for(first[0])) is not None:
                 tally = VoxelTally(module, first[0].device)
                 for points, class_ids in clouds:
                     tally.add_points(points, class_ids.int(), origin, voxel_size)
                 if not tally.all_near():
                     raise _too_far(voxel_size)
                 return cls(voxel_size, origin, num_classes, *tally.pure(), dense_bytes)
-        seen = ((_pack(_voxels(points, origin, voxel_size)), class_ids.int()) for points, class_ids in clouds)
-        sightings = Sightings(seen, num_classes, origin.device)
-        kept = sightings.by_votes() if votes else sightings.alone()
-        return cls(voxel_size, origin, num_classes, sightings.keys[kept], sightings.classes[kept], dense_bytes)
+        keys = torch.zeros(0, dtype=torch.int64, device=origin.device)
+        classes = keys.int()
+        for points, class_ids in clouds:
+            own = _pack(_voxels(points, origin, voxel_size))
+            keys, classes = _distinct(torch.cat([keys, own]), torch.cat([classes, class_ids.int()]), num_classes)
+        _, voxel, seen = torch.unique(keys, return_inverse=True, return_counts=True)
+        alone = seen[voxel] == 1
+        return cls(voxel_size, origin, num_classes, keys[alone], classes[alone], dense_bytes)
 
     def only(self, classes: Tensor) -> VisibilityGrid:
         """Return the grid of some classes alone, which needs less memory. classes: [C] int, ids in any order."""
@@ -82,10 +84,6 @@ class VisibilityGrid:
         return VisibilityGrid(
             self.voxel_size, self.origin, self.num_classes, self.keys[kept], self.classes[kept], self._dense_bytes
         )
-
-    def centres(self, keys: Tensor) -> Tensor:
-        """Return [M, 3] float32, world, the centres of voxels by their keys [M]."""
-        return (self.origin + (_unpack(keys).double() + 0.5) * self.voxel_size).float()
 
     def to(self, device: torch.device | str) -> VisibilityGrid:
         """Return the grid on a device; itself if it lies there already."""
@@ -224,6 +222,13 @@ class VisibilityGrid:
             return torch.zeros_like(linear, dtype=torch.bool)
         position = torch.searchsorted(self._valid_keys, linear).clamp_(max=len(self._valid_keys) - 1)
         return (self._valid_keys[position] == linear) & known
+
+
+def _distinct(keys: Tensor, classes: Tensor, num_classes: int) -> tuple[Tensor, Tensor]:
+    """Return the distinct pairs, ordered; 64 bits hold a key's rank and a class, but no key."""
+    voxels, rank = torch.unique(keys, return_inverse=True)
+    pairs = torch.unique(rank * num_classes + classes)
+    return voxels[pairs // num_classes], (pairs % num_classes).int()
 
 
 def _count(keys: Tensor, voxels: Tensor) -> Tensor:

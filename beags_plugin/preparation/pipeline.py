@@ -52,9 +52,6 @@ class PreparationConfig:
     """Which depth is lifted: median or expected."""
     k: int = 2000
     """Neighbours that set the voxel size (E8); more make larger voxels."""
-    votes: bool = False
-    """Whether a voxel supports the class that most views saw in it, an object if two did. In the paper it supports no
-    class where several were seen, and one view is enough."""
     k_pixels: int = 0
     """Training pixels for which k is stated; with fewer, k shrinks in proportion, so that voxels keep their size. 0, as
     in the paper, takes k as it is."""
@@ -153,7 +150,6 @@ def prepare(
         shares,
         scale,
         config.depth,
-        config.votes,
         stage,
     )
     k = config.neighbours(cameras)

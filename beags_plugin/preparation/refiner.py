@@ -29,7 +29,7 @@ class AssignedScene:
     objects: their ids, ascending, without the background.
     contributions: C of E6, of the base. scale: units of the run's frame per unit of the input poses'.
     depth: the depth of the surface: see ``rasterizers.rendering.surface_depth``.
-    votes: see ``PreparationConfig``. stage: opens a progress bar with a title.
+    stage: opens a progress bar with a title.
     """
 
     surfels: Surfels
@@ -44,7 +44,6 @@ class AssignedScene:
     contributions: Contributions
     scale: float = 1.0
     depth: str = "median"
-    votes: bool = False
     stage: Stage = lambda title: nullcontext()
 
 

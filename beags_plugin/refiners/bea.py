@@ -29,5 +29,4 @@ class BeaRefiner(Refiner):
             seed=scene.seed,
             depth=scene.depth,
             progress=progress,
-            votes=scene.votes,
         )
