@@ -98,7 +98,7 @@ def test_rows_of_the_bases_of_presets_train_these(file, rows):
             preset_config(name, overrides, Path()).model_config
             for name, overrides in ((experiment.preset, variants[row]), (name, {}))
         )
-        refinement = {"refine_steps", "refine_position_lr_factor", "losses", "close_contacts"}
+        refinement = {"refine_steps", "losses", "close_contacts"}
         assert {key for key, value in vars(own).items() if value != getattr(preset, key)} <= refinement, row
 
 
@@ -107,18 +107,16 @@ WITH_CONTROLS = [str(BENCHMARKS[name]) for name in ("background", "photo-size", 
 
 @pytest.mark.parametrize("name", [*WITH_QUALITY, *WITH_CONTROLS])
 def test_every_length_of_refinement_has_its_control(name):
-    """A gain in PSNR is one over as many steps with no loss of masks; where figures are reported, at equal rates."""
-    lengths: dict[bool, set[tuple[int, float]]] = {True: set(), False: set()}
+    """A gain in PSNR is one over as many steps with no loss of masks."""
+    lengths: dict[bool, set[int]] = {True: set(), False: set()}
     experiment = load_experiment(name)
     for variant in experiment.variants:
         model = preset_config(experiment.preset, variant.refine, Path(name)).model_config
         control = not any(model.losses[loss].weight for loss in ("boundary", "occupancy", "silhouette"))
         assert control == ("neither loss" in variant.name)
         if model.refiner == "bea":
-            lengths[control].add((model.refine_steps, model.refine_position_lr_factor))
-    assert {steps for steps, _ in lengths[False]} == {steps for steps, _ in lengths[True]}
-    if name in REPORTING or name in WITH_CONTROLS:
-        assert lengths[False] == lengths[True]
+            lengths[control].add(model.refine_steps)
+    assert lengths[False] == lengths[True]
 
 
 def test_a_file_describes_variants_and_sweeps(experiment):

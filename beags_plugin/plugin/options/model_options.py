@@ -83,8 +83,6 @@ class BeagsModelConfig(ModelConfig):
     """Weight decay of colours that depend on the view (AdamW's, of the coefficients of degrees 1 and up) in the base:
     each step takes this times their learning rate of them away. With 0, as in the official code, they learn by heart
     what photos differ in by chance. A base that polishes takes none. It is added to the group's own weight decay."""
-    refine_position_lr_factor: float = 1.0
-    """Factor of the positions' learning rate while refining; 1, as in the paper, is the end of the base schedule."""
     close_contacts: bool = False
     """After the last step of a refinement by losses: close objects, such as the lid of a box, where other objects hid
     them from every photo. It takes a second or more for each object."""
@@ -111,8 +109,6 @@ class BeagsModelConfig(ModelConfig):
             raise UserError(f"base_lr_factor is {self.base_lr_factor}: give a factor above 0.")
         if not 0 <= self.sh_decay <= MOST_DECAY:
             raise UserError(f"sh_decay is {self.sh_decay}: give a number from 0 (no decay) to {MOST_DECAY}.")
-        if not 0 <= self.refine_position_lr_factor < math.inf:
-            raise UserError(f"refine_position_lr_factor is {self.refine_position_lr_factor}: give 0 or more.")
         self.pyramid.check()
         make_refiner(self.refiner, self.refiner_options)
 

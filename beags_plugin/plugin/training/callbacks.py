@@ -110,5 +110,4 @@ def set_learning_rates(model: SceneModel, adam: Adam, configs: dict[str, Any], s
             group["weight_decay"] += model.config.sh_decay
         if group["name"] == "means":
             rate = log_linear(*model.config.position_lr, progress) * model.extent_on_host()
-            rate *= model.config.refine_position_lr_factor if refining and model.own_training is None else 1.0
         group["lr"] = rate if group["name"] == "opacities" else rate * faster

@@ -45,7 +45,7 @@ def test_the_papers_preset_changes_nothing_but_what_is_chosen_by_size_and_exposu
     assert (model.prepare.reprojection, documented.prepare.reprojection) == ("pairwise", "auto")
     assert (model.exposure, documented.exposure) == ("off", "auto")
     assert replace(model, exposure="auto", prepare=replace(model.prepare, reprojection="auto")) == documented
-    assert (model.refine_position_lr_factor, model.losses["silhouette"].weight) == (1.0, 0.0)
+    assert model.losses["silhouette"].weight == 0.0
 
 
 def test_the_papers_preset_pins_every_choice_that_is_an_option():

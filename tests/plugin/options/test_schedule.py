@@ -156,10 +156,8 @@ def test_official_learning_rates(model):
     configs["scales"]["optimizer"].eps = 1e-6  # not what Adam was made or loaded with
     rates(0)
     assert [group["name"] for group in adam.param_groups if group["eps"] != 1e-15] == ["scales"]
-    model.config.refine_position_lr_factor = 10.0  # of refinement alone
-    assert rates(29_999)["means"] == pytest.approx(2.5 * 1.6e-6, rel=1e-3)
     model.schedule = PhaseSchedule(30_000, 3_000, 30_000)
-    assert rates(30_000) == pytest.approx({"means": 2.5 * 1.6e-4 * 100**-0.9 * 10, **constant})
+    assert rates(30_000) == pytest.approx({"means": 2.5 * 1.6e-4 * 100**-0.9, **constant})
 
     def decays(step):
         rates(step)
