@@ -71,6 +71,7 @@ SHIPPED = {
     "compare": "The paper's twelve other methods beside this one, from one base, on identical masks.",
     "compare-consistent": "The same with the consistent masks of this method for all.",
     "classes": "How time and memory of each method grow with the number of classes.",
+    "refinement": "What each part of our refinement gives beside the paper's losses, on larger scenes.",
     "improvements": "What each extension of ours gives, beside both losses alone.",
 }
 """Commands by experiment, with the sentence of their help."""
