@@ -18,6 +18,7 @@ from beags_plugin.labels.classes import read_mask, write_mask
 from beags_plugin.system.digests import folder_digest, value_digest
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import progress_bar
+from beags_plugin.system.reading.arrays import load_array
 from beags_plugin.system.whole_files import write_text_atomically
 
 if TYPE_CHECKING:
@@ -145,7 +146,8 @@ def damaged_masks(scene: TrialScene, degree: float, folder: Path, write: bool = 
             labels = read_mask(mask, kind, outputs.metadata["ignore_ids"])
             if split == "train":
                 if flawed is not None:
-                    labels = flawed(labels, np.load(scene.data / f"ground_truth/depth/{image.stem}.npy"), image.stem)
+                    depth = load_array(scene.data / f"ground_truth/depth/{image.stem}.npy")
+                    labels = flawed(labels, depth, image.stem)
                 ranks = np.where(labels == IGNORE, len(classes), np.searchsorted(classes, labels))
                 ranks = degrade.degrade_mask(ranks, len(classes), degradation, scene.seed, image.stem)
                 labels = np.append(classes, IGNORE)[ranks]
