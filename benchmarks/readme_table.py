@@ -21,35 +21,23 @@ from beags_plugin.system.whole_files import write_text_atomically
 
 ROOT = Path(__file__).resolve().parents[1]
 BEGIN, END = "<!-- made by python -m benchmarks.readme_table -->\n", "<!-- end of the table -->\n"
-FAST = ("assignment alone", "as long as beags-fast, neither loss", "beags-fast")
-PAPER = ("as long as beags-paper, neither loss", "beags-paper")  # assignment alone is that of FAST, from the same base
+CAPTURED = ("assignment alone", "the paper's losses", "beags-fast", "beags-refine")
 GROUPS: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
-    ("five generated tabletops, base of `beags-fast`", "presets", "tabletop", FAST),
-    ("the same scenes and base", "presets-paper", "tabletop", PAPER),
-    ("the same scenes, base of `beags`", "presets-whole", "tabletop", ()),
-    ("five generated rooms, base of `beags-fast`", "presets", "room", FAST),
-    ("the same scenes and base", "presets-paper", "room", PAPER),
-    ("the same scenes, base of `beags`", "presets-whole", "room", ()),
-    ("fruit, a real capture, base of `beags-fast`", "presets-captures", "fruit", FAST),
-    ("the same, base of `beags`", "presets-whole-captures", "fruit", ()),
-    ("a skull, a real capture, base of `beags-fast`", "presets-captures", "dtu_skull", FAST),
-    ("the same, base of `beags`", "presets-whole-captures", "dtu_skull", ()),
+    ("a bear, masks from photos alone", "captures", "bear, salient", CAPTURED),
+    ("a digger (kitchen), masks from photos alone", "captures", "kitchen, salient", CAPTURED),
 )
 """What a group of rows is called, its file in docs/results, the scene or the family of generated scenes there, and its
 variants (or all)."""
-LABELS = {
-    "beags-paper": "`beags-paper`, k by [the rule](docs/method.md#5-the-visibility-voxel-grid)",
-}
 WORST = "worst_biou_after"
 COLUMNS: tuple[tuple[str, tuple[str, ...], int, float], ...] = (
-    ("extracted IoU, BIoU", ("extracted_iou_after", "extracted_biou_after"), 1, 100.0),
-    ("worst object's BIoU", (WORST,), 1, 100.0),
-    ("PSNR", ("psnr_after",), 2, 1.0),
-    ("PSNR shown", ("psnr_shown_after",), 2, 1.0),
-    ("removal PSNR, shown", ("removal_psnr_after", "removal_psnr_shown_after"), 2, 1.0),
+    ("extracted IoU, BIoU, %", ("extracted_iou_after", "extracted_biou_after"), 1, 100.0),
+    ("spill, %", ("extracted_spill_after",), 1, 100.0),
+    ("PSNR after colour fit, dB", ("psnr_fit_after",), 2, 1.0),
+    ("CPU seconds after the base", ("cpu_seconds",), 0, 1.0),
 )
 """Head, figures, digits, factor; a column without figures is left out."""
 _SOURCE = ("experiment", "preset", "reference", "command", "commit", "machine", "torch", "busy", "quick", "protocol")
+_KEPT = (WORST, "psnr_after", "psnr_shown_after", "removal_psnr_after", "removal_psnr_shown_after")  # by older tables
 _ROW = ("scene", "seed", "variant", "failed", "failures", "error_left", "lost_biou", "shown_after", "ssim_after",
         "rendered_iou_after", "rendered_biou_after", "extracted_spill_before", "extracted_spill_after",
         "psnr_fit_before", "psnr_fit_after", "removal_ssim_after", "removal_remains_after", "steps",
@@ -67,7 +55,7 @@ def reduced(report: Mapping[str, Any]) -> dict[str, Any]:
         if (name := line.get("object", MEAN)) != MEAN:
             value = line[_OF_OBJECTS]
             objects.setdefault(_place(line), {})[name] = None if value is None else round(value, 4)
-    kept = (*_ROW, *(figure for _, figures, *_ in COLUMNS for figure in figures))
+    kept = (*_ROW, *_KEPT, *(figure for _, figures, *_ in COLUMNS for figure in figures))
 
     def row(full: Mapping[str, Any]) -> dict[str, Any]:
         found = {name: full[name] for name in kept if full.get(name) is not None}
@@ -108,7 +96,7 @@ def table(folder: Path) -> str:
             cells = [", ".join(number(row.get(f), digits, factor) for f in fs) for _, fs, digits, factor in columns]
             variant = row["variant"]
             label = f"`{variant}`" if variant.startswith("beags") and " " not in variant else variant
-            lines.append([scene, LABELS.get(variant, label), *cells])
+            lines.append([scene, label, *cells])
             scene = ""
     return "".join(f"| {' | '.join(line)} |\n".replace("|  |", "| |") for line in lines)
 

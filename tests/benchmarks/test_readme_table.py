@@ -33,26 +33,15 @@ def test_readme_has_the_figures_of_the_committed_files():
     text = (ROOT / "README.md").read_text()
     shown = text.partition(readme_table.BEGIN)[2].partition(readme_table.END)[0]
     assert shown.strip() == readme_table.table(RESULTS).strip()
-    places = (
-        ("presets", "beags-fast", "tabletop"),
-        ("presets-whole", "beags", "tabletop"),
-        ("presets", "beags-fast", "room"),
-        ("presets-whole", "beags", "room"),
-        ("presets-captures", "beags-fast", "fruit"),
-        ("presets-whole-captures", "beags", "fruit"),
-        ("presets-captures", "beags-fast", "dtu_skull"),
-        ("presets-whole-captures", "beags", "dtu_skull"),
-    )
-    of_presets = (row for row in cells(shown) if row[1] in ("`beags-fast`", "`beags`"))
-    for (name, preset, scene), row in zip(places, of_presets, strict=True):
-        rows = json.loads((RESULTS / f"{name}.json").read_text())["rows"]
-        own = [row for row in rows if row["variant"] == preset and row["scene"].startswith(scene)]
-        iou, biou, psnr = (
-            sum(row[name] for row in own) / len(own)
-            for name in ("extracted_iou_after", "extracted_biou_after", "psnr_after")
-        )
-        assert row[2] == f"{100 * iou:.1f}, {100 * biou:.1f}"
-        assert row[1 + cells(shown)[0][1:].index("PSNR")] == f"{psnr:.2f}"
+    rows = json.loads((RESULTS / "captures.json").read_text())["rows"]
+    places = [(scene, variant) for scene in ("bear, salient", "kitchen, salient")
+              for variant in readme_table.CAPTURED]  # fmt: skip
+    assert len(cells(shown)) == 2 + len(places)
+    for (scene, variant), row in zip(places, cells(shown)[2:], strict=True):
+        (own,) = (row for row in rows if row["variant"] == variant and row["scene"] == scene)
+        assert row[1].strip("`") == variant
+        assert row[2] == f"{100 * own['extracted_iou_after']:.1f}, {100 * own['extracted_biou_after']:.1f}"
+        assert row[3] == f"{100 * own['extracted_spill_after']:.1f}" and row[4] == f"{own['psnr_fit_after']:.2f}"
     for name in {name for _, name, *_ in readme_table.GROUPS}:
         source = json.loads((RESULTS / f"{name}.json").read_text())
         assert source["command"] and source["commit"] and source["machine"]["cpu"] and not source["quick"]
@@ -68,46 +57,47 @@ def objects_of(place: int, figures: dict) -> dict[str, dict]:
 
 @pytest.fixture
 def clone(tmp_path):
-    """A folder with README and results, and a fresh result of the presets, with objects and a failure."""
+    """A folder with README and results, and a fresh result of captures, with objects and a failure."""
     shutil.copytree(RESULTS, tmp_path / "docs/results", ignore=shutil.ignore_patterns("*.png"))
     shutil.copy(ROOT / "README.md", tmp_path)
     experiment = load_experiment(written(tmp_path, GOOD))
     figures = {**dict.fromkeys(FIGURES), "extracted_iou_after": 0.91234567, "extracted_biou_after": 0.8,
-               "worst_biou_after": 0.5, "psnr_after": 30.126, "psnr_shown_after": 31.0, **COSTS}  # fmt: skip
+               "worst_biou_after": 0.5, "psnr_fit_after": 30.126, "extracted_spill_after": 0.025, **COSTS}  # fmt: skip
     rows = [
         ResultRow(Variant(name), scene, 1, figures, objects_of(place, figures), protocol=Protocol(), truth="visible")
-        for place, scene in enumerate(("tabletop 1", "tabletop 2", "room 1"))
-        for name in readme_table.FAST[:2]
+        for place, scene in enumerate(("bear, salient", "kitchen, salient", "fruit, given"))
+        for name in readme_table.CAPTURED[:3]
     ]
-    for scene in ("tabletop 1", "room 1"):
-        rows.append(ResultRow(Variant("beags-fast"), scene, 1, dict.fromkeys(FIGURES), {}, "no memory"))
-    command = "beags bench presets --data /data/fruit tin --output /tmp/bench --scenes 1"
+    for scene in ("bear, salient", "kitchen, salient", "fruit, given"):
+        rows.append(ResultRow(Variant("beags-refine"), scene, 1, dict.fromkeys(FIGURES), {}, "no memory"))
+    command = "beags bench captures --data-root /data/scenes --output /tmp/bench --scenes bear"
     source = {"command": command, "commit": "abc", "machine": {"cpu": "x"}, "torch": "2", "quick": False}
-    (tmp_path / "presets.json").write_text(json.dumps(report_json(experiment, rows, source)))
+    (tmp_path / "captures.json").write_text(json.dumps(report_json(experiment, rows, source)))
     return tmp_path
 
 
 def test_one_command_makes_the_table_from_a_result(clone):
-    readme_table.main([str(clone / "presets.json")], clone)
-    kept = json.loads((clone / "docs/results/presets.json").read_text())
-    assert kept["command"] == "beags bench presets --data fruit tin --scenes 1"
+    readme_table.main([str(clone / "captures.json")], clone)
+    kept = json.loads((clone / "docs/results/captures.json").read_text())
+    assert kept["command"] == "beags bench captures --data-root scenes --scenes bear"
     assert kept["commit"] == "abc" and kept["machine"] == {"cpu": "x"}
     assert kept["protocol"].startswith("Protocol: extracted masks against visible masks, less")
-    scenes = ["tabletop 1"] * 2 + ["tabletop 2"] * 2 + ["room 1"] * 2 + ["tabletop 1", "room 1"]
+    names = ["bear, salient", "kitchen, salient", "fruit, given"]
+    scenes = [name for name in names for _ in range(3)] + names
     assert [row["scene"] for row in kept["rows"]] == scenes
-    assert kept["rows"][6]["failed"] == "no memory" and "objects" not in kept["rows"][6]
-    bious = [{"cup": biou, "box": None} for biou in (0.8, 0.8, 0.8123, 0.8123, 0.8247, 0.8247)]
-    assert [row["objects"] for row in kept["rows"][:6]] == bious and "objects" not in kept["means"][0]
+    assert kept["rows"][9]["failed"] == "no memory" and "objects" not in kept["rows"][9]
+    bious = [{"cup": biou, "box": None} for biou in (0.8, 0.8123, 0.8247) for _ in range(3)]
+    assert [row["objects"] for row in kept["rows"][:9]] == bious and "objects" not in kept["means"][0]
     assert readme_table.reduced(kept) == kept
     assert kept["means"][0]["extracted_iou_after"] == 0.912346
     assert COSTS.items() <= kept["rows"][0].items() and COSTS.items() <= kept["means"][0].items()
-    assert not COSTS.keys() & kept["rows"][6].keys()  # failed
+    assert not COSTS.keys() & kept["rows"][9].keys()  # failed
     text = (clone / "README.md").read_text()
-    head, line, alone, control, failed, *_ = cells(text.partition(readme_table.BEGIN)[2])
-    assert head[2:] == ["extracted IoU, BIoU", "worst object's BIoU", "PSNR", "PSNR shown", "removal PSNR, shown"]
-    assert alone[1:] == ["assignment alone", "91.2, 80.0", "50.0", "30.13", "31.00", "–, –"]
-    assert control[1:] == ["as long as beags-fast, neither loss", *alone[2:]]
-    assert failed[1:] == ["`beags-fast`", "–, –", "–", "–", "–", "–, –"] and line[0] == "---"
+    head, line, alone, paper, fast, failed, *_ = cells(text.partition(readme_table.BEGIN)[2])
+    assert head[2:4] == ["extracted IoU, BIoU, %", "spill, %"]
+    assert alone[1:] == ["assignment alone", "91.2, 80.0", "2.5", "30.13", "40"]
+    assert paper[1:] == ["the paper's losses", *alone[2:]] and fast[1:] == ["`beags-fast`", *alone[2:]]
+    assert failed[1:] == ["`beags-refine`", "–, –", "–", "–", "–"] and line[0] == "---"
     readme_table.main([], clone)
     assert (clone / "README.md").read_text() == text and text.startswith("# beags")
     assert text.endswith((ROOT / "README.md").read_text().partition(readme_table.END)[2])
@@ -124,7 +114,7 @@ def test_a_family_of_scenes_is_averaged_and_keeps_its_worst_object(tmp_path):
 
 
 def test_what_cannot_be_a_table_is_refused(clone):
-    captures = clone / "docs/results/presets-captures.json"
+    captures = clone / "docs/results/captures.json"
     content = json.loads(captures.read_text())
     left = [row for row in content["rows"] if row["variant"] != "beags-fast"]
     for change, words in (({"quick": True}, "figures mean nothing"), ({"rows": left}, "no figures of 'beags-fast'")):
