@@ -37,7 +37,13 @@ COLUMNS: tuple[tuple[str, tuple[str, ...], int, float], ...] = (
 )
 """Head, figures, digits, factor; a column without figures is left out."""
 _SOURCE = ("experiment", "preset", "reference", "command", "commit", "machine", "torch", "busy", "quick", "protocol")
-_KEPT = (WORST, "psnr_after", "psnr_shown_after", "removal_psnr_after", "removal_psnr_shown_after")  # by older tables
+_KEPT = (
+    WORST,
+    "psnr_after",
+    "psnr_shown_after",
+    "removal_psnr_after",
+    "removal_psnr_shown_after",
+)  # Other tables show them.
 _ROW = ("scene", "seed", "variant", "failed", "failures", "error_left", "lost_biou", "shown_after", "ssim_after",
         "rendered_iou_after", "rendered_biou_after", "extracted_spill_before", "extracted_spill_after",
         "psnr_fit_before", "psnr_fit_after", "removal_ssim_after", "removal_remains_after", "steps",

@@ -16,7 +16,7 @@ USEFUL_ANGLE = 8.0  # degrees from which a wider angle makes no better neighbour
 LEAST_SHARED = 10  # points that both photos of a pair show
 NEARER, FARTHER = 0.6, 3.0  # Depths may exceed those of the known points by these factors.
 OTHERS = 12  # photos that a depth is verified in: those that share most
-AGREE = 2  # of them that must have the same depth
+AGREE = 2  # So many of them must have the same depth.
 WORKERS = 4  # threads at most; each takes 300 MB for a photo of 30,000 pixels
 STEPS, PIXELS = 1.5, 1.5  # between planes, and of a photo, by which depths that agree may differ
 

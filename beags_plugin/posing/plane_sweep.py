@@ -14,9 +14,9 @@ import numpy as np
 
 PLANES = 96  # depths, even in inverse depth
 WINDOW = (7, 7)  # pixels that are correlated
-LEAST_CORRELATION = 0.5  # of a pixel whose depth is believed
-LEAST_MARGIN = 0.02  # by which the cost of all other depths must exceed that of the best one
-LEAST_VARIANCE = 1e-5  # of grey values in 0..1; a plainer window is like any other plain one
+LEAST_CORRELATION = 0.5  # A pixel that fits its neighbours less is not believed.
+LEAST_MARGIN = 0.02  # All other depths must cost more than the best one by this.
+LEAST_VARIANCE = 1e-5  # A window whose grey values, in 0..1, vary less is like any other plain one.
 SMALL_CHANGE, LARGE_CHANGE = 0.1, 0.6  # costs of a depth that changes by one plane, or more, from pixel to pixel
 AT_EDGES = 20.0  # A large change costs less where the photo changes too: by 1 + this times the change of grey.
 _UNSEEN = 1.2  # cost of a depth at which no neighbour shows the pixel: that of no correlation at all

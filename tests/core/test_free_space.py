@@ -52,8 +52,8 @@ def discs(means: list[list[float]], scales: tuple[float, float] = (1e-3, 1e-3)) 
 
 def test_what_stands_before_a_camera_is_told_from_what_stands_beside_behind_or_beyond_it():
     means = [
-        [0.0, 0.0, 0.5],  # before the camera
-        [0.27, 0.0, 0.5],  # beside the picture by less than a tenth of its width
+        [0.0, 0.0, 0.5],  # It stands before the camera.
+        [0.27, 0.0, 0.5],  # It is beside the picture by less than a tenth of its width.
         [0.4, 0.0, 0.5],  # further beside it
         [0.0, 0.0, -0.5],  # behind it
         [0.0, 0.0, 1.1],  # beyond the depth

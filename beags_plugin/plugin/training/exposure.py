@@ -45,7 +45,7 @@ class PhotoExposures:
         self.affine = exposures.affine.to(model.device).clone().requires_grad_()
         self.start = self.affine.detach().clone()
         self.identity = torch.eye(3, 4).to(self.affine)
-        self.moments = torch.zeros(2, *self.affine.shape).to(self.affine)  # of first and second order
+        self.moments = torch.zeros(2, *self.affine.shape).to(self.affine)  # Adam's, first and second
         self.steps = torch.zeros(len(self.affine), dtype=torch.long)
         model.exposures = Exposures(exposures.names, self.affine.detach())  # which shares the memory
         self._seen: int | None = None

@@ -47,7 +47,7 @@ class RefinementSwitch:
         self.ready = False  # to refine
         self._switching = False  # in the middle of the last base step, before nerfstudio evaluates and saves it
         self._evaluation_due = False
-        self.prepared = False  # in this process or one that it resumes
+        self.prepared = False  # A run that is resumed may have done it before.
         model.prepared = False
 
     @property

@@ -17,7 +17,7 @@ from beags_plugin.posing.plane_sweep import PosedPhoto
 from beags_plugin.system.progress import progress_bar, say
 
 MOST_PHOTOS = 50  # More show what is in them from enough sides, and would take minutes.
-SWEPT_PIXELS = 30_000  # of a photo, as it is compared
+SWEPT_PIXELS = 30_000  # Larger photos are shrunk to as many before they are compared.
 PIXELS_OF_POINT = 200  # training pixels for which there is a point
 
 

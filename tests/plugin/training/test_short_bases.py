@@ -67,15 +67,20 @@ def test_a_base_of_all_means_is_resumed_bit_for_bit(data, tmp_path, monkeypatch)
     assert_same_run(killed, whole)
 
 
-@pytest.mark.parametrize("stop", [31, 11])  # the scene still grows then, or no more
-def test_what_stands_before_a_camera_goes_while_the_base_trains(tmp_path, monkeypatch, stop):
-    """Before each round some Gaussians are moved into the space that seed points leave empty; none of them is left."""
-    data = write_scene(tmp_path / "data")
+def with_seed_points(data):
+    """Put 200 seed points into a scene of transforms.json, which it returns."""
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3)).astype("<f4")
     with open(data / "points.ply", "wb") as file:
         write_vertices(file, points.view([(name, "<f4") for name in "xyz"])[:, 0])
     content = json.loads((data / "transforms.json").read_text())
     (data / "transforms.json").write_text(json.dumps(content | {"ply_file_path": "points.ply"}))
+    return data
+
+
+@pytest.mark.parametrize("stop", [31, 11])  # the scene still grows then, or no more
+def test_what_stands_before_a_camera_goes_while_the_base_trains(tmp_path, monkeypatch, stop):
+    """Before each round some Gaussians are moved into the space that seed points leave empty; none of them is left."""
+    data = with_seed_points(write_scene(tmp_path / "data"))
     counts, free = [], densifier.Densifier._free_cameras
 
     def moved(own):
@@ -98,12 +103,7 @@ def test_what_stands_before_a_camera_goes_while_the_base_trains(tmp_path, monkey
 
 
 def test_many_gaussians_before_cameras_are_a_scene_whose_seed_points_lack_what_is_near(tmp_path, monkeypatch, capsys):
-    data = write_scene(tmp_path / "data")
-    points = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3)).astype("<f4")
-    with open(data / "points.ply", "wb") as file:
-        write_vertices(file, points.view([(name, "<f4") for name in "xyz"])[:, 0])
-    content = json.loads((data / "transforms.json").read_text())
-    (data / "transforms.json").write_text(json.dumps(content | {"ply_file_path": "points.ply"}))
+    data = with_seed_points(write_scene(tmp_path / "data"))
     asked = []
 
     def many(surfels, cameras, depths):

@@ -45,7 +45,7 @@ def test_masks_of_a_former_run_in_the_folder_are_not_shown_while_a_base_is_train
     run = window.model.viewing.run
     assert run.mask(0, "before", 20, 12) is not None and run.mask(0, "after", 20, 12) is None
     assert not run.has_grid and not run.load_grid()
-    window.model.prepared = True  # as the switch to refinement says once it is done
+    window.model.prepared = True  # The switch to refinement says so once it is done.
     first = run.mask(0, "after", 20, 12)
     path = tmp_path / "run/prepared/masks" / f"{run.names[0]}.png"
     write_mask(path, np.zeros((12, 20), np.uint8))  # prepared again
