@@ -35,12 +35,17 @@ class Densifier:
         self.free = self._free_depths()
 
     def state(self) -> dict[str, Any]:
-        """Return the statistics since the scene last grew, as long as it grows; see ``resumable.Resumable``."""
+        """Return the statistics since the scene last grew, as long as it grows, and whether cameras are freed.
+
+        See ``resumable.Resumable``.
+        """
         found = self.statistics if self.model.growing else GradientStatistics(0)
-        return {"total": found.total, "views": found.views}
+        return {"total": found.total, "views": found.views, "frees": self.free is not None}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on gathering, in the first process alone: a checkpoint lacks the statistics of the others."""
+        if not state["frees"]:
+            self.free = None
         if processes.rank() == 0 and len(state["total"]) == self.model.num_points:
             kept = self.statistics
             kept.total, kept.views = state["total"].clone().to(kept.total), state["views"].clone().to(kept.views)

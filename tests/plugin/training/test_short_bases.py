@@ -108,7 +108,7 @@ def test_many_gaussians_before_cameras_are_a_scene_whose_seed_points_lack_what_i
 
     def many(surfels, cameras, depths):
         asked.append(len(surfels))
-        return torch.arange(len(surfels)) % 4 == 0
+        return torch.arange(len(surfels)) % (4 if len(asked) == 1 else 10) == 0  # Later they would be few enough.
 
     monkeypatch.setattr(densifier, "reaches_before_camera", many)
     options = {"pipeline.model.densify.every": 15, "pipeline.model.densify.start": 10,
@@ -119,6 +119,12 @@ def test_many_gaussians_before_cameras_are_a_scene_whose_seed_points_lack_what_i
     run_to_end(usual_config(data, tmp_path / "never", **options, **{"pipeline.model.densify.free_share": 0.0}))
     assert len(asked) == 1
     assert_same_run(tmp_path / "kept", tmp_path / "never")
+    asked.clear()
+    options["pipeline.model.densify.free_share"] = 0.7
+    interrupted(data, tmp_path / "killed", monkeypatch, lambda patch: kill_at(patch, 20), **options)
+    resume_to_end(tmp_path / "killed")
+    assert len(asked) == 1, "a run that is resumed knows that it frees nothing"
+    assert_same_run(tmp_path / "killed", tmp_path / "kept")
 
 
 def test_nothing_is_known_of_the_space_before_cameras_where_seed_points_were_generated(data, tmp_path, monkeypatch):
