@@ -22,11 +22,15 @@ class NothingToExport(UserError):
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """The training cameras, and the rasterizer for views from there; all in the frame of the file."""
+    """The training cameras, and the rasterizer for views from there; all in the frame of the file.
+
+    scene: the whole scene, what an item is a part of; no view sees the item where the rest hides it. None if unknown.
+    """
 
     cameras: Sequence[Camera]
     rasterizer: Rasterizer
     settings: RasterSettings
+    scene: Surfels | None = None
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,13 @@ from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import ExportItem, Viewpoints
 from beags_plugin.export.closing_surfels import closing_gaussians, joined
+from beags_plugin.export.fusion import TAU
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.extraction.select import select_class
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
 
 LEAST_VIEWS = 2  # in which another object hides a place from its front
-TAU = 0.02  # of a depth, by which depths may err
 _FACING = 0.1  # least cosine between a place's normal and the way to a camera that looks at its front
 
 
@@ -87,6 +87,7 @@ def contact_faces(
     and views.
     """
     found: list[ContactFaces] = []
+    in_scene = replace(views, scene=surfels)  # through its open lid a box alone would show its inside
     objects = [class_id for class_id in names if class_id != BACKGROUND and bool(members.of(class_id).any())]
     if len(objects) < 2:  # nothing touches
         objects = []
@@ -95,7 +96,7 @@ def contact_faces(
         progress(done, total)
         part = select_class(surfels, members, class_id)[0]
         ids = torch.full((len(part),), class_id, dtype=torch.int32)
-        more = closing_gaussians(ExportItem(names[class_id], part, ids, views), options)[0]
+        more = closing_gaussians(ExportItem(names[class_id], part, ids, in_scene), options)[0]
         found.append(ContactFaces(more, torch.full((len(more),), class_id, dtype=torch.int32)))
     candidates = ContactFaces(
         joined(surfels[:0], *(each.surfels for each in found)),

@@ -20,7 +20,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import Viewpoints
 from beags_plugin.export.close_up import close_up
 from beags_plugin.export.frames import bounding_box
-from beags_plugin.rasterizers.rendering import surfel_inputs
+from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth, surfel_inputs
 
 BLOCK = 16
 """Voxels along a side of the blocks that Open3D allocates as a whole."""
@@ -28,6 +28,7 @@ PIXELS_PER_VOXEL = 2
 """Of the renders: discs smaller than a pixel are rendered a pixel wide, on slanted surfaces too near."""
 _VOXEL_BYTES = 20  # distance, weight and three colours, float32 each
 _STRIDE = 4  # pixels between those at which Open3D looks for blocks
+TAU = 0.02  # of a depth, by which depths may err
 _SOLID = 0.5  # the median depth exists where more light than this is stopped
 
 
@@ -74,7 +75,7 @@ def fuse(
     min_views: int,
     on_render: Callable[[int], None] = lambda done: None,
 ) -> Mesh:
-    """Fuse the surface that at least ``min_views`` of the views show of an object rendered alone.
+    """Fuse the surface that at least ``min_views`` of the views show of an object rendered alone, or in its scene.
 
     surfels: N surfels, in the frame of the views. resolution: voxels along the longest side of their box; renders are
     close-ups of it, ``PIXELS_PER_VOXEL`` times as many pixels long. truncation: voxels on either side of the surface
@@ -121,12 +122,16 @@ def _new_grid() -> Any:
 
 
 def _draw(surfels: Surfels, camera: Camera, views: Viewpoints, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Render median depth [H, W], 0 where nothing solid is or outside the box low, high, and colour [H, W, 3]."""
+    """Render median depth [H, W], 0 where nothing solid is seen or outside the box low, high, and colour [H, W, 3]."""
     black = torch.zeros(3, dtype=surfels.means.dtype)
     drawn = views.rasterizer.rasterize(surfel_inputs(surfels, camera), camera, views.settings, black)
     assert drawn.median_depth is not None  # geometry is on unless the settings turn it off
     points = lift(drawn.median_depth, camera)
     inside = ((points >= low) & (points <= high)).all(dim=-1) & (drawn.alpha > _SOLID)
+    if views.scene is not None:
+        whole = views.rasterizer.rasterize(geometry_inputs(views.scene), camera, views.settings, black)
+        shown = surface_depth(whole, "median")
+        inside &= (shown == 0) | (drawn.median_depth <= (1.0 + TAU) * shown)
     depth = torch.where(inside, drawn.median_depth, 0.0)
     # without the black that shines through
     return depth, (drawn.color / drawn.alpha.clamp(min=_SOLID)[..., None]).clamp(0.0, 1.0)
