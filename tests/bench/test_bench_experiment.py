@@ -29,7 +29,7 @@ WITH_QUALITY = [name for name in experiment_names() if name != "classes"]  # whi
 REPORTING = {"presets", "compare", "compare-consistent"}
 BENCHMARKS = {path.stem: path for path in sorted((ROOT / "benchmarks").glob("*.toml"))}
 REPORTING_BENCHMARKS = {
-    "comparison-more", "official-base", "photo-size", "presets-rooms", "presets-tiny", "presets-whole",
+    "comparison-more", "official-base", "photo-size", "presets-tiny", "presets-whole",
     "time-to-quality",
 }  # fmt: skip
 
@@ -57,7 +57,6 @@ def test_files_of_benchmarks_keep_them_apart_too(name):
     [
         ("presets", 3),
         ("compare", 2),
-        (str(ROOT / "benchmarks/presets-captures.toml"), 2),
         (str(ROOT / "benchmarks/presets-whole.toml"), 1),
         (str(ROOT / "benchmarks/photo-size.toml"), 1),
         (str(ROOT / "benchmarks/presets-tiny.toml"), 1),
@@ -102,7 +101,7 @@ def test_rows_of_the_bases_of_presets_train_these(file, rows):
         assert {key for key, value in vars(own).items() if value != getattr(preset, key)} <= refinement, row
 
 
-WITH_CONTROLS = [str(BENCHMARKS[name]) for name in ("background", "photo-size", "presets-tiny", "presets-whole")]
+WITH_CONTROLS = [str(BENCHMARKS[name]) for name in ("photo-size", "presets-tiny", "presets-whole")]
 
 
 @pytest.mark.parametrize("name", [*WITH_QUALITY, *WITH_CONTROLS])
