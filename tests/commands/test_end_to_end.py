@@ -84,8 +84,9 @@ def test_the_base_is_kept_apart_and_has_classes(trained):
     folder, _ = trained
     base, refined = read_assigned_run(folder / "base" / "config.yml"), read_assigned_run(folder / "config.yml")
     means, moved = base.state["gauss_params.means"], refined.state["gauss_params.means"]
-    assert len(moved) == len(means) and (base.state["class_ids"] == refined.state["class_ids"]).all()
-    assert not any((moved == position).all(dim=1).any() for position in means[base.state["class_ids"] > 0])
+    own = len(means)  # those that close contacts come after them
+    assert len(moved) >= own and (base.state["class_ids"] == refined.state["class_ids"][:own]).all()
+    assert not any((moved[:own] == position).all(dim=1).any() for position in means[base.state["class_ids"] > 0])
     assert len(base.classes) >= 6
     assert (base.state["class_ids"] > 0).any()
 

@@ -1,9 +1,9 @@
-"""The commands of README.md, run one after the other in a folder of their own.
+"""The commands of README.md and docs/commands.md, run one after the other in a folder of their own.
 
 Programs are started, but for most commands of beags, which run in this process.
 
 ``RUN`` lists commands with flags that make them quick; ``OWN`` replaces the reader's names. ``ELSEWHERE`` lists the
-other commands, each with the reason. Together they must be all of README.md.
+other commands, each with the reason. Together they must be all of both pages.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from viewer_pages import free_port
 
 BIN = Path(sys.executable).parent
 PROGRAM = re.compile(r"(beags|ns-[a-z]+|make|pip|python) |scripts/")
-README = (ROOT / "README.md").read_text("utf8")
+README = "\n".join((ROOT / page).read_text("utf8") for page in ("README.md", "docs/commands.md"))
 
 SHORT = (
     "--vis tensorboard --machine.device-type cpu --pipeline.model.base-steps 60 --pipeline.model.refine-steps 10 "
@@ -99,7 +99,7 @@ def commands() -> set[str]:
 def test_every_command_is_run_or_listed_with_a_reason():
     found = commands()
     assert len(found) > 25
-    assert found == {*RUN, *ELSEWHERE}, "neither run nor listed, or no longer in README.md"
+    assert found == {*RUN, *ELSEWHERE}, "neither run nor listed, or no longer in these pages"
     assert not set(RUN) & set(ELSEWHERE) and all(ELSEWHERE.values())
 
 

@@ -29,7 +29,7 @@ from beags_plugin.plugin.objects.evaluate import evaluate_run
 from beags_plugin.plugin.runs.read import read_run
 from beags_plugin.plugin.training import contacts
 
-CLOSE = {"pipeline.model.close_contacts": True}
+CLOSE, OPEN = ({"pipeline.model.close_contacts": closed} for closed in (True, False))
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def three_faces(monkeypatch):
 
 
 def test_the_last_step_adds_the_faces_and_changes_nothing_else(data, tmp_path, three_faces, capsys):
-    run_to_end(short_config(data, tmp_path / "without"))
+    run_to_end(short_config(data, tmp_path / "without", **OPEN))
     run_to_end(short_config(data, tmp_path / "with", **CLOSE))
     assert "closed where neighbours hide objects: 1 of " in capsys.readouterr().out
     (call,) = three_faces
@@ -109,7 +109,7 @@ def test_a_run_that_was_killed_while_it_closed_contacts_ends_the_same(data, tmp_
 
 
 def test_a_run_that_cannot_be_closed_is_kept_as_it_was_trained(data, tmp_path, monkeypatch, capsys):
-    run_to_end(short_config(data, tmp_path / "without"))
+    run_to_end(short_config(data, tmp_path / "without", **OPEN))
     monkeypatch.setitem(sys.modules, "open3d", None)  # an import of it fails
     run_to_end(short_config(data, tmp_path / "with", **CLOSE))
     said = " ".join(capsys.readouterr().out.split())
