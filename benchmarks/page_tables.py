@@ -39,14 +39,13 @@ BEAR, DIGGER, FRUIT, VASE = "bear, salient", "kitchen, salient", "fruit, given",
 class PageTable:
     """A table of one page: a line for each row of a result, a column for each of its scenes.
 
-    page: path below the root. name: in its marks. file: of docs/results, without ".json". columns: scenes by what they
-    are called. rows: names of the result's rows. figures: what each cell holds, in order.
+    page: path below the root. name: in its marks. columns: by what they are called, the file of docs/results, without
+    ".json", and the scene there. rows: names of the results' rows. figures: what each cell holds, in order.
     """
 
     page: str
     name: str
-    file: str
-    columns: Mapping[str, str]
+    columns: Mapping[str, tuple[str, str]]
     rows: Sequence[str]
     figures: Sequence[Figure]
 
@@ -56,12 +55,13 @@ class PageTable:
         return f"<!-- table {self.name}, made by python -m benchmarks.page_tables -->\n"
 
 
+CAPTURES = {"bear": ("captures", BEAR), "digger": ("captures", DIGGER)}
+"""README's columns."""
 TABLES: tuple[PageTable, ...] = (
     PageTable(
         "README.md",
         "captures",
-        "captures",
-        {"bear": BEAR, "digger": DIGGER},
+        CAPTURES,
         ("assignment alone", "the paper's losses", "beags-fast", "beags-refine"),
         (BIOU, SPILL, FITTED, SECONDS),
     ),
@@ -124,22 +124,22 @@ def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 def lines_of(table: PageTable, folder: Path) -> str:
     """Return a table in Markdown, from the files of ``folder``; raises ``UserError`` for what lacks."""
-    path = folder / f"{table.file}.json"
-    known = {
-        (row["variant"], row["scene"]): row
-        for row in json.loads(path.read_text())["rows"]
-        if row.get("object", MEAN) == MEAN
-    }
     lines = [["", *table.columns], ["---"] * (1 + len(table.columns))]
     for name in table.rows:
         cells = []
-        for scene in table.columns.values():
-            if (row := known.get((name, scene))) is None:
-                raise UserError(f"{path} has no figures of {name!r} on {scene!r}: name a whole result of beags bench.")
+        for file, scene in table.columns.values():
+            row = _row_of(folder / f"{file}.json", name, scene)
             shown = (number(row.get(figure), digits, factor) for figure, digits, factor in table.figures)
             cells.append("failed" if row.get("failed") else ", ".join(shown))
         lines.append([f"`{name}`" if name.startswith("beags") and " " not in name else name, *cells])
     return "".join(f"| {' | '.join(line)} |\n".replace("|  |", "| |") for line in lines)
+
+
+def _row_of(path: Path, name: str, scene: str) -> Mapping[str, Any]:
+    for row in json.loads(path.read_text())["rows"]:
+        if (row["variant"], row["scene"], row.get("object", MEAN)) == (name, scene, MEAN):
+            return row
+    raise UserError(f"{path} has no figures of {name!r} on {scene!r}: name a whole result of beags bench.")
 
 
 def write_tables(root: Path = ROOT) -> None:
