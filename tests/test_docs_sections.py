@@ -11,7 +11,11 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 CITING = ("beags_plugin", "tests", "benchmarks", "experiments", "method_configs")
 SUFFIXES = {".py", ".h", ".cpp", ".cu", ".cuh", ".toml", ".yaml", ".yml"}
-DOCUMENTS = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+DOCUMENTS = [
+    ROOT / "README.md",
+    ROOT / "benchmarks" / "README.md",
+    *(path for room in ("docs", "notes") for path in sorted((ROOT / room).rglob("*.md"))),
+]
 
 # "section 4", "sections 2, 3 and 5"; of other papers than ours only with dotted numbers ("sections 3.7.2, 4.4").
 CITATION = re.compile(r"\bsections?\s+(\d[\d.]*(?:(?:,\s*|,?\s+and\s+)\d[\d.]*)*)", re.IGNORECASE)
@@ -31,11 +35,11 @@ def cited(text: str) -> Iterator[str]:
 
 
 def test_the_documents_have_each_heading_that_comments_name():
-    """A file of docs/, a comma, then headings in quotes; a comment may break them over two lines."""
+    """A file of docs/ or notes/, a comma, then headings in quotes; a comment may break them over two lines."""
     lost, count = [], 0
     for path in [*sources(), *sorted((ROOT / "benchmarks").rglob("*.md"))]:
         joined = re.sub(r"\s*\n\s*(?:#|//|\*)?\s*", " ", path.read_text("utf-8"))
-        for name, titles in re.findall(r'(docs/[\w-]+\.md),((?:,? (?:and )?"[^"]+")+)', joined):
+        for name, titles in re.findall(r'((?:docs|notes)/[\w-]+\.md),((?:,? (?:and )?"[^"]+")+)', joined):
             for title in re.findall(r'"([^"]+)"', titles):
                 count += 1
                 if f"# {title}\n" not in (ROOT / name).read_text("utf-8"):

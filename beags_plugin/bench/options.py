@@ -16,7 +16,7 @@ class EngineOptions:
     plan: bool = False
     """Only print the trials, and the hours, memory and disk that they will take."""
     engine: str = "local"
-    """What runs the trials: local (this machine, one after the other) or ray (a Ray cluster; docs/cluster.md)."""
+    """What runs the trials: local (this machine, one after the other) or ray (a Ray cluster; docs/experiments.md)."""
     address: str | None = None
     """Address of the Ray cluster: auto (the one that this machine is part of), or host:port; if left out, Ray is
     started on this machine alone."""
