@@ -3,7 +3,7 @@
     python -m benchmarks.cuda [--quick | --smoke] [--json FILE] [--seconds 500] [--gsplat-seconds 150]
 
 Figures are medians of CUDA events around whole calls, after warming up. What does not fit into --seconds is left out
-and named. See docs/cuda.md.
+and named. See notes/speed.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A training in several processes, each with a replica of the scene: see docs/cuda.md.
+"""A training in several processes, each with a replica of the scene: see notes/speed.md, "Several GPUs".
 
 Each step, every process renders a view of its own, and the gradients are averaged; all else that changes the scene is
 computed alike in all. Only the first process writes the run: the others write into a folder that they remove.
