@@ -13,6 +13,8 @@ from beags_plugin.cleaning.silhouettes import MaskedViews
 from beags_plugin.core.surfels import Surfels
 
 OUTSIDE = 0.2  # share of a Gaussian's weight outside the masks from which on it may be left out
+CHIP = 0.005  # share of an object's weight inside its masks below which a part far from it is a chip
+FAR = 0.1  # of the object's longest side
 MOST = 0.5  # share of an object's Gaussians; where more would go, masks and object contradict each other
 
 
@@ -50,7 +52,8 @@ def clean(part: Surfels, class_id: int, views: MaskedViews) -> tuple[Tensor, Lef
     The object is drawn alone. A Gaussian may leave its visual hull if it has a fifth or more of its weight outside the
     masks, where nothing hides it; it is left out unless that opens more in the masks than it clears beside them. Of the
     rest, parts that hang together with no other (``connected_parts``) are left out if they have no more weight inside
-    the masks than outside; the part with the most weight inside stays.
+    the masks than outside; the part with the most weight inside stays. Parts far from it that have next to none of the
+    weight inside are errors that a few masks share, and are left out too.
 
     part: M Gaussians of class ``class_id``, in the frame of the views. If more than half of them would go, none does.
     """
@@ -69,8 +72,21 @@ def clean(part: Surfels, class_id: int, views: MaskedViews) -> tuple[Tensor, Lef
         loose[within.argmax()] = False
     dropped = spikes.copy()
     dropped[left[loose[parts]]] = True
+    dropped |= _chips(part, inside, dropped)
     if dropped.sum() > MOST * len(part):
         doubt = f"its masks contradict {int(dropped.sum())} of its {len(part)} Gaussians"
         return torch.arange(len(part)), LeftOut(doubt=doubt)
     keep = torch.from_numpy(np.flatnonzero(~dropped))
     return keep, LeftOut(int(spikes.sum()), int((dropped & ~spikes).sum()))
+
+
+def _chips(part: Surfels, inside: np.ndarray, dropped: np.ndarray) -> np.ndarray:
+    """Return [M] bool, the Gaussians of small parts that lie ``FAR`` from all else; inside: [M] weight in the masks."""
+    chips = np.zeros(len(part), bool)
+    left = np.flatnonzero(~dropped)
+    parts = connected_parts(part[torch.from_numpy(left)], FAR)
+    left, parts = left[parts >= 0], parts[parts >= 0]
+    if len(left):
+        within = np.bincount(parts, inside[left])
+        chips[left[(within < CHIP * within.sum())[parts]]] = True
+    return chips

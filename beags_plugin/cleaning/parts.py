@@ -18,13 +18,14 @@ _BULK = 0.01  # share of the Gaussians at each side that do not count for the ob
 _FURTHEST = 1000.0  # sides of the object from its middle; what lies further off is put there, so that cells have keys
 
 
-def connected_parts(surfels: Surfels) -> np.ndarray:
+def connected_parts(surfels: Surfels, gap_share: float = GAP) -> np.ndarray:
     """Return [N] int64, the part of each of an object's Gaussians, from 0; -1 for those that no picture can show.
 
     Points on each disc, up to two standard deviations from its centre, are put into cubic cells; Gaussians in one cell
     or in neighbouring ones hang together. Memory is linear in the Gaussians.
 
     surfels: N Gaussians of one object, world. Those that are not finite or fainter than 1/255 are in no part.
+    gap_share: side of a cell over the object's longest side, at least ``GAP``.
     """
     bare = surfels.detach()
     means = bare.means.double().cpu().numpy()
@@ -40,11 +41,11 @@ def connected_parts(surfels: Surfels) -> np.ndarray:
     if not side > 0:
         parts[shown] = 0
         return parts
-    gap, middle = GAP * side, (low + high) / 2
+    gap, middle = gap_share * side, (low + high) / 2
     half_axes = axes[:, :, :2] * scales[:, None, :]
     cells, owners = [], []
     for owner, points in _footprints(means, half_axes, scales / gap, np.flatnonzero(shown)):
-        away = np.clip((points - middle) / gap, -_FURTHEST / GAP, _FURTHEST / GAP)
+        away = np.clip((points - middle) / gap, -_FURTHEST / gap_share, _FURTHEST / gap_share)
         pairs = np.unique(np.stack([_key(np.floor(away).astype(np.int64)), owner]), axis=1)
         cells.append(pairs[0])
         owners.append(pairs[1])

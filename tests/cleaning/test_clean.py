@@ -116,6 +116,22 @@ def test_a_part_that_masks_show_apart_stays():
     assert hidden > 0 and len(clean(both, 1, masked)[0]) == 220
 
 
+def test_a_chip_that_a_few_masks_take_for_the_object_is_left_out():
+    """The masks of two views show it; a part as small that touches the object's surroundings stays."""
+    body, chip = ball(), ball((1.3, 0.0, 0.0), 0.03, 6)
+    scene = joined(body, chip)
+    shown, unseen = (views(each, ones(each), scene).labels for each in (scene, body))
+    labels = [*shown[:2], *(torch.where(a != b, 65535, b) for a, b in zip(shown[2:], unseen[2:], strict=True))]
+    masked = replace(views(scene, ones(scene), scene), labels=labels)
+    inside, outside, hidden, _ = masked.evidence(scene, 1)[200:].sum(axis=0)
+    assert inside > outside + hidden, "the masks support it"
+    keep, left_out = clean(scene, 1, masked)
+    assert keep.tolist() == list(range(200)) and left_out == LeftOut(loose=6)
+    near = joined(body, ball((0.6, 0.0, 0.0), 0.03, 6))
+    assert len(set(connected_parts(near).tolist())) == 2
+    assert len(clean(near, 1, views(near, ones(near), near))[0]) == 206
+
+
 def test_a_disc_without_which_the_object_had_a_hole_stays():
     body = ball()
     body = body[body.means[:, 2] < 0.35]
