@@ -13,6 +13,7 @@ import numpy as np
 from beags_plugin.posing.photos import FEWEST, Look, look_at
 from beags_plugin.system.digests import content_digest
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.stand_ins import stand_in
 from beags_plugin.system.progress import Bar, counted
 from beags_plugin.system.whole_files import write_text_atomically, write_whole
 
@@ -119,6 +120,8 @@ def _frames(video: Path) -> Iterator[tuple[Iterator[Any], int]]:
             stream.thread_type = "AUTO"
             yield container.decode(stream), stream.frames
     except (av.error.FFmpegError, IndexError) as error:
+        if (cause := stand_in(video)) is not None:
+            raise UserError(f"the video {video} cannot be read: {cause}.") from error
         raise UserError(f"the video {video} cannot be read ({error}): convert it to an .mp4 of H.264.") from error
 
 

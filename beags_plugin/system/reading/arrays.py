@@ -12,6 +12,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.lib import format as npy
 
+from beags_plugin.system.reading.stand_ins import stand_in
+
 
 def load_array(path: Path) -> np.ndarray:
     """Read the array of numbers (or plain values) in a .npy file.
@@ -20,7 +22,10 @@ def load_array(path: Path) -> np.ndarray:
     shorter than its header says.
     """
     with open(path, "rb") as file:
-        check_header(file, os.fstat(file.fileno()).st_size)
+        try:
+            check_header(file, os.fstat(file.fileno()).st_size)
+        except ValueError as error:
+            raise ValueError(stand_in(path) or str(error)) from None
         file.seek(0)
         return npy.read_array(file, allow_pickle=False)
 
@@ -36,7 +41,7 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
             return found
     # what zipfile and zlib raise for archives that are damaged, have passwords or ask for what Python lacks
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OverflowError, zlib.error) as error:
-        raise ValueError(str(error) or type(error).__name__) from None
+        raise ValueError(stand_in(path) or str(error) or type(error).__name__) from None
 
 
 def read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.stand_ins import stand_in
 from beags_plugin.system.reading.text import reason
 
 if TYPE_CHECKING:
@@ -44,6 +45,8 @@ def read_image(path: Path | str, read: Callable[[Image], T], what: str = "the im
     except (UserError, FileNotFoundError):
         raise
     except UnidentifiedImageError as error:
+        if (cause := stand_in(path)) is not None:
+            raise UserError(f"{what} {path} cannot be read: {cause}.") from error
         raise broken(f"it is none of {', '.join(FORMATS)}", error) from error
     except Image.DecompressionBombError as error:
         raise broken(f"it promises more than {MOST_PIXELS:,} pixels", error) from error

@@ -12,6 +12,8 @@ from typing import BinaryIO
 import numpy as np
 
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.colors import colors_of
+from beags_plugin.system.reading.stand_ins import stand_in
 from beags_plugin.system.reading.text import reason
 
 _HEADER_BYTES = 1 << 20  # a header is longer than this in no file that is one
@@ -96,7 +98,7 @@ def write_vertices(file: BinaryIO, table: np.ndarray) -> None:
 
 
 def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read positions [N, 3] float32 and colours [N, 3] uint8 (mid-grey if there are none) of a .ply's vertices.
+    """Read positions [N, 3] float64 and colours [N, 3] uint8 (mid-grey if there are none) of a .ply's vertices.
 
     Raises ``UserError`` if the file is absent or has no vertices with x, y, z.
     """
@@ -104,7 +106,7 @@ def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise UserError(f"the seed points {path} (ply_file_path) do not exist: restore the file or remove the key.")
     try:
         vertices = read_vertices(path)
-        points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
+        points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
     except OSError as error:
         raise UserError(f"the seed points {path} cannot be read ({error.strerror}): restore the file.") from error
     except (ValueError, MemoryError) as error:
@@ -113,12 +115,7 @@ def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
         ) from error
     if not np.isfinite(points).all():
         raise UserError(f"the seed points {path} are not all numbers: export them again, or remove the key.")
-    if not all(name in (vertices.dtype.names or ()) for name in ("red", "green", "blue")):
-        return points, np.full(points.shape, 128, np.uint8)
-    colors = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1)
-    if np.issubdtype(colors.dtype, np.floating):  # floats are shares of 1, integers are bytes
-        colors = np.clip(colors * 255.0 + 0.5, 0, 255)
-    return points, colors.astype(np.uint8)
+    return points, colors_of(vertices)
 
 
 def _check_size(path: Path, header: _Header) -> None:
@@ -140,7 +137,7 @@ def _read_header(path: Path) -> _Header:
         head = file.read(_HEADER_BYTES)
     feed = next((end for end in (b"\r\n", b"\n", b"\r") if head.startswith(b"ply" + end)), None)
     if feed is None or (feed + b"end_header") not in head:
-        raise ValueError("it does not start with a .ply header")
+        raise ValueError(stand_in(path) or "it does not start with a .ply header")
     text, mark, rest = head.partition(feed + b"end_header")
     body = len(text) + len(mark) + (len(feed) if rest.startswith(feed) else 0)
     order, elements = None, []

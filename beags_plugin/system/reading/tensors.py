@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beags_plugin.system.reading.stand_ins import stand_in
+
 
 def load_tensors(path: Path, mmap: bool = False) -> Any:
     """Read a file of ``torch.save`` to the CPU.
@@ -48,7 +50,7 @@ def _check_archive(path: Path, size: int) -> None:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
     except zipfile.BadZipFile:
-        raise ValueError("it is cut off, or no file of torch.save") from None
+        raise ValueError(stand_in(path) or "it is cut off, or no file of torch.save") from None
     if any(member.compress_type != zipfile.ZIP_STORED for member in members):
         raise ValueError("its members are packed, which torch.save never does")
     if sum(member.file_size for member in members) > size:

@@ -1,31 +1,80 @@
-"""JSON and TOML, with every failure as a ``ValueError``."""
+"""JSON, TOML and plain text as programs write them, with every failure as a ``ValueError``."""
 
 from __future__ import annotations
 
+import codecs
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from beags_plugin.system.reading.stand_ins import stand_in
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]  (installed on Python 3.10 only)
 
+_WIDE = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)  # editors and PowerShell of Windows write them
+# What other programs write into JSON: comments, a comma behind the last entry, and C's words for no number.
+_LOOSE = re.compile(
+    r'(?P<text>"(?:[^"\\]|\\.)*")'
+    r"|(?P<comment>//[^\n]*|/\*.*?\*/|^[ \t]*\#[^\n]*)"
+    r"|(?P<comma>,(?=(?:\s|//[^\n]*\n|/\*.*?\*/|\#[^\n]*\n)*[\]}]))"
+    r"|(?P<nan>[-+]?\b(?:[nN][aA][nN](?:\([\w.]*\))?|1\.\#(?:QNAN|SNAN|IND)\w*)(?![\w\"]))"
+    r"|(?P<sign>[-+]?)(?P<endless>\b(?:[iI][nN][fF](?:[iI][nN][iI][tT][yY])?|1\.\#INF\w*)(?![\w\"]))",
+    re.DOTALL | re.MULTILINE,
+)
+
+
+def read_text(path: Path) -> str:
+    """Read a text file: UTF-8 with or without a byte order mark, or UTF-16 with one.
+
+    Raises ``OSError`` if it cannot be read, ``ValueError`` if it is no such text.
+    """
+    content = path.read_bytes()
+    return content.decode("utf-16" if content.startswith(_WIDE) else "utf-8-sig")
+
 
 def load_json(path: Path, object_pairs_hook: Callable[[list], Any] | None = None) -> Any:
-    """Read a JSON file; raises ``OSError`` if it cannot be read, ``ValueError`` if it is no JSON."""
+    """Read a JSON file; raises ``OSError`` if it cannot be read, ``ValueError`` if it is no JSON.
+
+    Comments, a comma behind the last entry, and any spelling of NaN and Infinity are read too.
+    """
+    text = read_text(path)
     try:
-        return json.loads(path.read_bytes().decode("utf-8"), object_pairs_hook=object_pairs_hook)
+        return json.loads(text, object_pairs_hook=object_pairs_hook)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
+    except ValueError:
+        if (cause := stand_in(path)) is not None:
+            raise ValueError(cause) from None
+        if (strict := _LOOSE.sub(_strict, text)) == text:
+            raise
+        try:
+            return json.loads(strict, object_pairs_hook=object_pairs_hook)
+        except ValueError:
+            pass
+        raise
+
+
+def _strict(part: re.Match[str]) -> str:
+    """Return what JSON has for a match of ``_LOOSE``; line ends stay, so that errors name the right line."""
+    if part["text"] is not None:
+        return part["text"]
+    if part["nan"] is not None:
+        return "NaN"
+    if part["endless"] is not None:
+        return ("-" if part["sign"] == "-" else "") + "Infinity"
+    return "\n" * part[0].count("\n")
 
 
 def load_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file; raises as ``load_json``."""
     try:
-        return tomllib.loads(path.read_bytes().decode("utf-8"))
+        return tomllib.loads(read_text(path))
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
 
@@ -35,7 +84,7 @@ def reason(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     if isinstance(error, UnicodeDecodeError):
-        return f"byte {error.start} is no UTF-8"
+        return f"byte {error.start} is no {'UTF-16' if error.encoding.startswith('utf-16') else 'UTF-8'}"
     if isinstance(error, KeyError):
         return f"{error} is missing"
     words = " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,60 @@
+"""Colours of points as bytes, from whatever numbers a program wrote them in."""
+
+from __future__ import annotations
+
+import numpy as np
+
+GREY = 128
+SH_BAND_0 = 0.28209479177387814  # of the constant spherical harmonic: 3DGS's colours are 0.5 + this times f_dc
+_MOST = 0.99  # share of numbers that tell their range; a few may lie beyond it
+_NAMES = (
+    ("red", "green", "blue"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+    ("r", "g", "b"),
+    ("scalar_red", "scalar_green", "scalar_blue"),
+)
+
+
+def colors_of(table: np.ndarray) -> np.ndarray:
+    """Return the colours [N, 3] uint8 of points in a structured array; mid-grey where it has none that can be read.
+
+    Columns red, green, blue of other names and f_dc_0..2 of splats count too; see ``as_bytes``.
+    """
+    columns = {name.casefold(): name for name in table.dtype.names or ()}
+    for names in _NAMES:
+        if all(name in columns for name in names):
+            return as_bytes(np.stack([table[columns[name]] for name in names], axis=1))
+    bands = [f"f_dc_{index}" for index in range(3)]
+    if all(name in columns for name in bands):
+        shares = 0.5 + SH_BAND_0 * np.stack([table[columns[name]].astype(np.float64) for name in bands], axis=1)
+        return as_bytes(np.clip(np.nan_to_num(shares, nan=0.5), 0.0, 1.0))
+    return np.full((len(table), 3), GREY, np.uint8)
+
+
+def as_bytes(colors: np.ndarray) -> np.ndarray:
+    """Return colours [N, 3] of any type as uint8, by the type and the range, as viewers take them.
+
+    One byte is a byte. Wider integers are bytes up to 255, else 16 bits. Floats are shares of 1, bytes up to 255, or
+    16 bits. Mid-grey where a colour is no number, and for all if the numbers fit none of these.
+    """
+    if colors.dtype.itemsize == 1:
+        return np.ascontiguousarray(colors).view(np.uint8).reshape(colors.shape)
+    whole = colors.dtype.kind in "iu"
+    values = colors.astype(np.float64)
+    if whole and colors.dtype.itemsize == 2:
+        values[values < 0] += 65536  # 16 bits that lack the word unsigned
+    known = np.isfinite(values).all(axis=1)
+    if not known.any():
+        return np.full(values.shape, GREY, np.uint8)
+    least, most = np.quantile(values[known], [1.0 - _MOST, _MOST])
+    highest = values[known].max()
+    if not whole and least >= -0.05 and most <= 1.05:
+        factor = 255.0
+    elif least >= (0.0 if whole else -1.0) and (highest <= 255.0 or (not whole and most <= 256.0)):
+        factor = 1.0
+    elif least >= 0.0 and most <= 65535.0:
+        factor = 255.0 / 65535.0
+    else:
+        return np.full(values.shape, GREY, np.uint8)
+    scaled = np.clip(np.where(known[:, None], values, GREY / factor) * factor + 0.5, 0, 255)
+    return scaled.astype(np.uint8)

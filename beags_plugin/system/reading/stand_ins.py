@@ -1,0 +1,49 @@
+"""Files that stand in place of data: pointers of Git LFS and git-annex, web pages, and files without bytes."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+_HEAD = 2048  # bytes that tell; a pointer of Git LFS has fewer than 1024
+_LFS = b"version https://git-lfs.github.com/spec/"
+_ANNEX = re.compile(rb"^(?:\.\./|/)*\.?git/annex/objects/|^/annex/objects/")
+_XML = re.compile(rb"^\s*<\?xml[^>]*\?>\s*<(?:Error|Code)\b")  # what storage services answer in place of a file
+_PAGE = re.compile(rb"^\s*(?:<!--.*?-->\s*)*(?:<!doctype\s+html|<html\b|<head\b|<body\b)", re.IGNORECASE | re.DOTALL)
+
+
+def stand_in(path: Path | str) -> str | None:
+    """Return what a file is in place of data, and the command or the remedy, for the brackets of a sentence.
+
+    None for data, for what cannot be read, and for what is no file.
+    """
+    path = Path(path)
+    try:
+        if not path.is_file():
+            return None
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+    except OSError:
+        return None
+    return of_bytes(head, path.name)
+
+
+def of_bytes(head: bytes, name: str) -> str | None:
+    """Return what ``stand_in`` does for the first bytes of a file called ``name``."""
+    if not head:
+        return "it is empty, as after a download that broke off: get it again"
+    if head.startswith(_LFS):
+        return "it is a pointer of Git LFS, not the file itself: run git lfs pull in its folder"
+    if _ANNEX.match(head):
+        return f"it is a pointer of git-annex, not the file itself: run git annex get {_quoted(name)} in its folder"
+    if _PAGE.match(head.removeprefix(b"\xef\xbb\xbf")):
+        return "it is a web page, not the file itself: open the link in a browser and download the file"
+    if _XML.match(head):
+        return "it is an error message of the server, not the file itself: download it again"
+    return None
+
+
+def _quoted(name: str) -> str:
+    import shlex
+
+    return shlex.quote(name)
