@@ -138,37 +138,6 @@ def photo_names(images: Sequence[Path]) -> list[str]:
     return list(named)
 
 
-def existing_images(named: Sequence[Path], folder: Path, in_order: bool) -> list[Path]:
-    """Find the files of the images that a COLMAP model names; copies may have other names.
-
-    A missing file is replaced by the one of the same path with another suffix, else by the one in ``folder`` of the
-    same stem, if the stem is unique. If that finds no file and ``in_order``, as many files in ``folder`` as images are
-    paired with them in the order of names. Raises ``UserError`` if two files fit a name.
-    """
-    files = list_images(folder)
-    if all(path.exists() for path in named):
-        return list(named)
-    stems = Counter(path.stem for path in named)
-
-    def file_for(path: Path) -> Path:
-        alike = [other for other in list_images(path.parent) if other.stem == path.stem]
-        if not alike and stems[path.stem] == 1:
-            alike = [other for other in files if other.stem == path.stem]
-        if len(alike) > 1:
-            raise UserError(
-                f"{path} does not exist, and {alike[0]} or {alike[1]} could stand for it: remove one of them."
-            )
-        return alike[0] if alike else path
-
-    found = [path if path.exists() else file_for(path) for path in named]
-    if in_order and len(files) == len(named) and not any(path.exists() for path in found):
-        order = sorted(range(len(named)), key=lambda index: named[index].as_posix())
-        found = list(named)
-        for index, file in zip(order, files, strict=True):
-            found[index] = file
-    return found
-
-
 def files_of_views(folder: Path, images: Sequence[Path], images_root: Path) -> list[Path | None]:
     """Find each image's .png in ``folder``, by its path below ``images_root``, else by its stem; None without.
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from pathlib import Path
 
 from beags_plugin.data.dataset import ColmapModel, PoseTable
 from beags_plugin.data.files import image_size
 from beags_plugin.data.layout import read_dataset
+from beags_plugin.data.photo_files import PhotoFinder
+from beags_plugin.data.transforms_file import read_transforms
 from beags_plugin.system.errors import UserError
 
 QUICK_PIXELS = 50_000  # per view, at most
@@ -39,8 +40,10 @@ def _images(data: Path) -> list[Path]:
 
 
 def _first_frame(data: Path) -> list[Path]:
-    """Return the first image in transforms.json; none if that file is missing or damaged."""
+    """Return the first image of transforms.json that is there; none without, or if that file is damaged."""
     try:
-        return [data / json.loads((data / "transforms.json").read_text(encoding="utf-8"))["frames"][0]["file_path"]]
-    except (OSError, ValueError, LookupError, TypeError):
+        frames = read_transforms(data / "transforms.json")["frames"]
+        found = PhotoFinder([data, data / "images"]).find([frame["file_path"] for frame in frames])
+    except UserError:  # the data parser names what is wrong
         return []
+    return [path for path in found if path is not None][:1]

@@ -1,47 +1,39 @@
-"""nerfstudio's transforms.json, checked before nerfstudio reads it."""
+"""transforms.json of nerfstudio and of other programs, checked before poses are made of it."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
+from beags_plugin.data.frame_cameras import check_numbers, finite
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.stand_ins import stand_in
 from beags_plugin.system.reading.text import load_json, reason
-
-_FOCAL = ("fl_x", "fl_y")
-_SIZE = ("w", "h")
-_NEEDED = (*_FOCAL, *_SIZE, "cx", "cy")
-_NUMBERS = (*_NEEDED, "k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def read_transforms(file: Path) -> dict[str, Any]:
     """Read a transforms.json; raise ``UserError`` for the first frame without a file, a pose or a finite camera."""
     try:
         meta = load_json(file)
-        if not isinstance(meta, dict) or not isinstance(meta["frames"], list):
+        if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list):
             raise ValueError('it has no list "frames"')
     except (OSError, ValueError, KeyError) as error:
-        raise UserError(
-            f"{file} is not a nerfstudio transforms file ({reason(error)}): export the poses again."
-        ) from error
+        todo = "export the poses again" if stand_in(file) is None else "then try again"
+        raise UserError(f"{file} is not a nerfstudio transforms file ({reason(error)}): {todo}.") from error
     frames = meta["frames"]
     if len(frames) < 2:
         named = "only one frame" if frames else "no frames"
         raise UserError(f"{file} names {named}: give poses for at least two images.")
-    _check_numbers(file, "it", meta)
+    check_numbers(file, "it", meta)
     seen: set[str] = set()
     for index, frame in enumerate(frames):
         name = _checked_name(file, index, frame)
         if name in seen:
             raise UserError(f"{file} gives {name} two poses: keep one of its frames.")
         seen.add(name)
-        _check_numbers(file, f"the frame of {name}", frame)
-        _check_matrix(file, name, frame.get("transform_matrix"))
-        for key in _NEEDED:
-            given = {*meta, *frame}
-            if key not in given and not (key in _FOCAL and given & {"camera_angle_x", "camera_angle_y"}):
-                raise UserError(f"{file} has no {key}, neither for all frames nor for that of {name}: add it.")
+        check_numbers(file, f"the frame of {name}", frame)
+        _check_matrix(file, f"the frame of {name} in {file}", name, frame.get("transform_matrix"))
+    _check_rest(file, meta)
     return meta
 
 
@@ -52,31 +44,32 @@ def _checked_name(file: Path, index: int, frame: Any) -> str:
     return name
 
 
-def _check_numbers(file: Path, whose: str, entries: dict[str, Any]) -> None:
-    for key in _NUMBERS:
-        if key not in entries:
-            continue
-        value = entries[key]
-        if not _finite(value):
-            raise UserError(f"{file}: {whose} has {key} = {value!r:.40}, which is no finite number: correct it.")
-        if (key in _FOCAL and not value > 0) or (key in _SIZE and not 1 <= value <= 1e6):
-            least = "above 0" if key in _FOCAL else "a number of pixels"
-            raise UserError(f"{file}: {whose} has {key} = {value!r:.40}, which must be {least}: correct it.")
-
-
-def _check_matrix(file: Path, name: str, matrix: Any) -> None:
-    rows = (
-        isinstance(matrix, list) and len(matrix) in (3, 4) and all(isinstance(r, list) and len(r) == 4 for r in matrix)
-    )
-    if not rows:
-        raise UserError(f"the frame of {name} in {file} has no transform_matrix of 4 x 4 numbers: give it one.")
-    if not all(_finite(value) for row in matrix for value in row):
+def _check_matrix(file: Path, whose: str, name: str, matrix: Any) -> None:
+    if not _is_matrix(matrix):
+        raise UserError(f"{whose} has no transform_matrix of 4 x 4 numbers: give it one.")
+    if not all(finite(value) for row in matrix for value in row):
         raise UserError(f"the transform_matrix of {name} in {file} holds what is no finite number: correct it.")
 
 
-def _finite(value: Any) -> bool:
-    """Return whether a value from JSON is a number that fits into a float."""
-    try:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-    except OverflowError:
-        return False
+def _is_matrix(matrix: Any) -> bool:
+    """Return whether this is a list of 3 or 4 rows of 4 entries."""
+    return (
+        isinstance(matrix, list) and len(matrix) in (3, 4) and all(isinstance(r, list) and len(r) == 4 for r in matrix)
+    )
+
+
+def _check_rest(file: Path, meta: dict[str, Any]) -> None:
+    """Raise ``UserError`` for wrong entries of the whole file that say how the world was turned and what lies in it."""
+    applied = meta.get("applied_transform")
+    if applied is not None and not (_is_matrix(applied) and all(finite(value) for row in applied for value in row)):
+        raise UserError(f"{file} has an applied_transform that is no matrix of 3 x 4 numbers: correct or remove it.")
+    scale = meta.get("applied_scale")
+    if scale is not None and not (finite(scale) and scale > 0):
+        raise UserError(f"{file} has applied_scale = {scale!r:.40}, which must be above 0: correct or remove it.")
+    points = meta.get("ply_file_path")
+    if points is not None and not (isinstance(points, str) and points and "\0" not in points):
+        raise UserError(f"{file} has ply_file_path = {points!r:.40}, which is no path: correct or remove it.")
+    for key in ("train_filenames", "val_filenames", "test_filenames"):
+        names = meta.get(key)
+        if names is not None and not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+            raise UserError(f"{file} has {key} that are no list of paths: correct or remove them.")

@@ -40,6 +40,10 @@ mistakes(
         "not the size that the camera has": train_after(lambda at: write_image(at.photo, noise(0, 20, 20))),
         "16 bits per channel": train_after(lambda at: write_image(at.photo, np.zeros((12, 20), np.uint16))),
         "a bomb of 60,000 x 60,000 pixels": train_after(lambda at: huge_png(at.photo)),
+        "more than half missing": train_after(
+            lambda at: [(at.data / f"images/v{index:02d}.png").unlink() for index in range(5)]
+        ),
+        "one missing, and none may be": train_after(lambda at: at.photo.unlink(), "beags-data", "--strict", "True"),
         "only one": train_after(lambda at: at.edit_poses(lambda meta: meta.update(frames=meta["frames"][:1]))),
         "one file named by two poses": train_after(lambda at: at.edit_poses(name_one_twice)),
     },

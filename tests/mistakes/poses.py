@@ -67,6 +67,7 @@ def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-40])
 
 
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 9\n"
 HEADER = (
     b"ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
     b"property float x\nproperty float y\nproperty float z\nend_header\n"
@@ -84,9 +85,9 @@ mistakes(
         "focal length negative": entries(fl_y=-16.0),
         "focal length not a number": entries(fl_x=NAN),
         "focal length a word": entries(fl_x="wide"),
-        "focal length missing": entries(fl_x=None),
+        "focal length missing": entries(fl_x=None, fl_y=None),
         "width 0": entries(w=0),
-        "height missing": entries(h=None),
+        "an angle in degrees": entries(fl_x=None, fl_y=None, camera_angle_x=69.0),
         "principal point not a number": entries(cx=NAN),
         "distortion not a number": entries(k1=NAN),
         "distortion k4 a word": entries(k4="much"),
@@ -115,6 +116,9 @@ mistakes(
             lambda at: (write_colmap(at.data, folder="colmap/sparse/0"), cut(at.data / "colmap/sparse/0/images.bin")),
             "masks check --data {data}",
         ),
+        "COLMAP's cameras.bin is a pointer": colmap(lambda model: (model / "cameras.bin").write_bytes(POINTER)),
+        "transforms.json is a web page": transforms(b"<!DOCTYPE html><html><body>Sign in</body></html>"),
+        "seed points without a byte": seed_points(b""),
         "COLMAP's images.bin missing": colmap(lambda model: (model / "images.bin").unlink()),
     },
 )

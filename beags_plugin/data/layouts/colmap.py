@@ -7,6 +7,7 @@ from pathlib import Path
 from beags_plugin.data.dataset import ColmapModel, Dataset
 from beags_plugin.data.layout import Layout
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.text import read_text, reason
 
 FOLDERS = ("sparse/0", "colmap/sparse/0", "sparse")
 
@@ -42,13 +43,22 @@ def checked_model(root: Path) -> Path:
 
 
 def points_file(folder: Path) -> Path | None:
-    """Find the seed points of a COLMAP model; None without any (nerfstudio fails on an empty list)."""
+    """Find the seed points of a COLMAP model; None without any (nerfstudio fails on an empty list).
+
+    A binary file without a single byte, as a download that broke off leaves it, is none of an empty list.
+    """
     binary, text = folder / "points3D.bin", folder / "points3D.txt"
     if binary.is_file():  # the order in which nerfstudio looks; the file starts with a 64-bit count
-        return binary if any(binary.open("rb").read(8)) else None
+        with binary.open("rb") as file:
+            count = file.read(8)
+        return binary if any(count) or not count else None
     if not text.is_file():
         return None
-    return text if any(line.strip() and not line.startswith("#") for line in text.open(encoding="utf-8")) else None
+    try:
+        lines = read_text(text).splitlines()
+    except (OSError, ValueError) as error:
+        raise UserError(f"{text} cannot be read ({reason(error)}): export the model again.") from error
+    return text if any(line.strip() and not line.startswith("#") for line in lines) else None
 
 
 class Colmap(Layout):

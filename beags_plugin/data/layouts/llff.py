@@ -10,7 +10,7 @@ from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.colmap import complete_model, points_file
 from beags_plugin.data.poses_bounds import FILE, read_poses_bounds
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.text import reason
+from beags_plugin.system.reading.text import read_text, reason
 
 NVOS_TARGETS = {
     "fern": "IMG_4027",
@@ -87,13 +87,18 @@ def camera_names(root: Path, folder: Path) -> dict[str, str]:
     pairs = dict(zip((path.stem for path in _originals(root, len(stems))), stems, strict=False))
     if (root / ORIGINAL_NAMES).is_file():
         try:
-            lines = [line.split() for line in (root / ORIGINAL_NAMES).read_text("utf8").splitlines()]
+            lines = [_columns(line) for line in read_text(root / ORIGINAL_NAMES).splitlines()]
         except (OSError, ValueError) as error:
             raise UserError(
                 f"{root / ORIGINAL_NAMES} cannot be read ({reason(error)}): restore or remove it."
             ) from error
         pairs |= {Path(names[1]).stem: Path(names[0]).stem for names in lines if len(names) == 2}
     return pairs | {stem: stem for stem in stems}
+
+
+def _columns(line: str) -> list[str]:
+    """Return the name of a copy and that of the camera's file, the rest of the line; parted by a tab, if there is one."""
+    return [name.strip() for name in (line.split("\t", 1) if "\t" in line else line.split(maxsplit=1))]
 
 
 def _originals(root: Path, count: int) -> list[Path]:

@@ -9,7 +9,7 @@ from beags_plugin.data.files import largest_images, list_images, width_note
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.llff import lacks_poses, model_or_bounds
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.text import reason
+from beags_plugin.system.reading.text import read_text, reason
 
 CLASSES = "segmentations/classes.txt"
 
@@ -59,7 +59,7 @@ class ThreeDOvs(Layout):
 
 def _class_names(file: Path) -> list[str]:
     try:
-        names = [line.strip() for line in file.read_text("utf8").splitlines() if line.strip()]
+        names = [line.strip() for line in read_text(file).splitlines() if line.strip()]
     except (OSError, ValueError) as error:
         raise UserError(f"{file} cannot be read ({reason(error)}): write one class name on each line.") from error
     if not names or len(set(names)) < len(names):

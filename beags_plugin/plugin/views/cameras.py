@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
@@ -44,13 +43,6 @@ def resize_cameras(cameras: Cameras, widths: Tensor, heights: Tensor) -> None:
 def downscaled_size(sizes: Tensor, factor: float) -> Tensor:
     """Divide ``sizes``, pixels, by ``factor``: rounded, at least 1."""
     return torch.floor(sizes / factor + 0.5).clamp(min=1).to(torch.int64)
-
-
-def concatenate_cameras(parts: Sequence[Cameras]) -> Cameras:
-    """Join several one-dimensional batches into one [N]."""
-    names = ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height", "distortion_params", "camera_type")
-    joined: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-    return Cameras(**joined)
 
 
 def check_cameras(cameras: Cameras, images: Sequence[Path]) -> None:

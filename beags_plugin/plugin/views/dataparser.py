@@ -16,8 +16,8 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from tyro.conf import Suppress
 
-from beags_plugin.data.dataset import ColmapModel, Dataset, MaskKind, PoseTable, TransformsFile
-from beags_plugin.data.files import check_same_size, files_of_views, image_size, unposed_note
+from beags_plugin.data.dataset import Dataset, MaskKind
+from beags_plugin.data.files import check_same_size, files_of_views, image_size
 from beags_plugin.data.ground_truth import find_ground_truth, of_views, stray_note
 from beags_plugin.data.labels import read_class_names
 from beags_plugin.data.layout import read_dataset
@@ -25,7 +25,9 @@ from beags_plugin.data.split import split_views
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import NO_TRUTH
 from beags_plugin.plugin.views.cameras import check_cameras, downscaled_size, resize_cameras
-from beags_plugin.plugin.views.poses import Normalization, PosedViews, read_poses
+from beags_plugin.plugin.views.placing import Normalization, PlacedOutputs
+from beags_plugin.plugin.views.poses import PosedViews, read_poses
+from beags_plugin.plugin.views.recognised import images_root, recognised
 from beags_plugin.plugin.views.seed_points import starting_points
 from beags_plugin.system.errors import UserError, print_user_errors_plainly
 from beags_plugin.system.progress import say
@@ -77,6 +79,8 @@ class BeagsDataParserConfig(DataParserConfig):
     """Half the side of the scene box."""
     num_random_points: Suppress[int] = 50_000
     """Number of points to start from where the data brings none."""
+    strict: bool = False
+    """Refuse data of which photos are missing, instead of going on without them."""
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that nothing can be made of."""
@@ -129,12 +133,12 @@ class BeagsDataParser(DataParser):
         metadata["mask_filenames"] = [metadata["mask_filenames"][i] for i in chosen]
         if metadata["ground_truth"] is not None:
             metadata["ground_truth"] = of_views(metadata["ground_truth"], chosen)
-        return DataparserOutputs(
+        return PlacedOutputs(
             image_filenames=[views.images[i] for i in chosen],
             cameras=views.cameras[torch.tensor(chosen)],
-            scene_box=views.outputs.scene_box,
-            dataparser_transform=views.outputs.dataparser_transform,
-            dataparser_scale=views.outputs.dataparser_scale,
+            scene_box=views.scene_box,
+            dataparser_transform=views.placing.original,
+            dataparser_scale=views.placing.original_scale,
             metadata=metadata,
         )
 
@@ -144,7 +148,7 @@ class BeagsDataParser(DataParser):
         config.check()
         self._scene = scene = read_dataset(Path(config.data).absolute(), config.layout, config.images_path)
         options = {name: getattr(config, name) for name in Normalization.__dataclass_fields__}
-        views = read_poses(scene.poses, scene.root, Normalization(**options))
+        views = read_poses(scene.poses, scene.root, Normalization(**options), config.strict)
         check_cameras(views.cameras, views.images)
         return scene, views
 
@@ -169,12 +173,12 @@ class BeagsDataParser(DataParser):
             folder, kind = scene.root / self.config.masks_path, "ids"
         elif scene.mask_files is not None:
             return [scene.mask_files.get(image.stem) for image in views.images], folder, kind
-        return files_of_views(folder, views.images, _images_root(scene)), folder, kind
+        return files_of_views(folder, views.images, images_root(scene)), folder, kind
 
     def _read(self) -> None:
         scene, views = self.posed_views()
         self._metadata = self._read_metadata(scene, views)
-        for line in self._recognised(scene, views):
+        for line in recognised(self, scene, views, self._metadata):
             say(line)
         self._views = views
 
@@ -191,7 +195,7 @@ class BeagsDataParser(DataParser):
             )
         check_same_size(masks, sizes)
         present = [mask for mask in masks if mask is not None and kind == "ids"]
-        truth = (scene.root / config.ground_truth_path, views.images, _images_root(scene))
+        truth = (scene.root / config.ground_truth_path, views.images, images_root(scene))
         classes_file = scene.root / config.classes_path
         self._check_named(folder, classes_file)
         known = (scene.class_names, scene.class_names_file)
@@ -250,56 +254,6 @@ class BeagsDataParser(DataParser):
         config = self.config
         train, held_out = split_views(views.stems, self._scene.split, config.eval_interval, config.held_out)
         return train if split == "train" else held_out
-
-    def _recognised(self, scene: Dataset, views: PosedViews) -> list[str]:
-        """Describe in a line how the data was understood, and add notes for the user."""
-        stems = set().union(*views.stems)
-        absent = [name for name in scene.split.held_out if name not in stems]
-        notes = [
-            f"The protocol holds out {name}, which no image here is called: name that view with beags-data --held-out."
-            for name in absent
-        ]
-        truth = self._metadata["ground_truth"] or {"visible": {}, "silhouettes": {}}
-        if unknown := sorted({*truth["visible"], *truth["silhouettes"]} - set(self._metadata["classes"].values())):
-            notes.append(
-                f"Exact masks of {', '.join(map(repr, unknown))} do not count, as no class is called so: "
-                f'name the classes in {scene.root / self.config.classes_path}, {{"id": "name"}}.'
-            )
-        unposed = None if isinstance(scene.poses, PoseTable) else unposed_note(views.images)
-        notes += [note for note in (self._metadata["stray_truth"], unposed) if note is not None]
-        masks = self._metadata["mask_filenames"]
-        points = "random" if self._metadata["points3D_random"] else len(self._metadata["points3D_xyz"])
-        line = (
-            f"{scene.root}: {scene.layout} layout, poses of {_source(scene)}, {len(views.images)} images in "
-            f"{views.images[0].parent.name} ({self._split_in_words(views, scene)}), "
-            f"{sum(mask is not None for mask in masks) or 'no'} masks, {points} seed points."
-        )
-        if scene.size_note and self.config.downscale_factor in (None, scene.downscale):
-            notes.append(scene.size_note)
-        return [line, *notes, *scene.notes]
-
-    def _split_in_words(self, views: PosedViews, scene: Dataset) -> str:
-        if views.members is not None:
-            return "splits named by the data"
-        train, out = (self.views_of_split(views, split) for split in ("train", "test"))
-        if train == out:
-            return "none held out"
-        named = [name for name in scene.split.held_out if any(name in views.stems[i] for i in out)]
-        also = f", {', '.join(named[:3])}{', ...' if len(named) > 3 else ''} by protocol" if named else ""
-        return f"{len(out)} held out{also}"
-
-
-def _images_root(scene: Dataset) -> Path:
-    """Return the folder below which images and masks have the same paths."""
-    if isinstance(scene.poses, TransformsFile):
-        return scene.poses.images or scene.root / "images"
-    return scene.poses.images if isinstance(scene.poses, ColmapModel) else scene.poses.images[0].parent
-
-
-def _source(scene: Dataset) -> str:
-    poses = scene.poses
-    file = poses.folder if isinstance(poses, ColmapModel) else poses.file
-    return f"{file.relative_to(scene.root) if file.is_relative_to(scene.root) else file}"
 
 
 beags_data = DataParserSpecification(

@@ -18,6 +18,7 @@ from beags_plugin.system.progress import say
 from beags_plugin.system.reading.ply import read_ply_points
 
 SEED = 0  # of the sampled points
+_FAR, _TOO_FAR = 100.0, 1e4  # cameras' reach beyond which points count only if a photo shows them, or not at all
 
 
 def starting_points(scene: Dataset, views: PosedViews, count: int) -> dict[str, Any]:
@@ -27,24 +28,24 @@ def starting_points(scene: Dataset, views: PosedViews, count: int) -> dict[str, 
     sampled: between the depths of the poses, if these have any. Points of a file are taken only if they lie between
     those depths. Raises ``UserError`` for a file that cannot be read.
     """
-    given = views.outputs.metadata
-    found = {name: given.get(name) for name in ("points3D_xyz", "points3D_rgb")}
     cameras = [camera_from_nerfstudio(views.cameras, index) for index in range(len(views.images))]
     bounds = scene.poses.bounds if isinstance(scene.poses, PoseTable) else None
-    scale = views.outputs.dataparser_scale
-    file = scene.seed_points
+    scale = views.placing.scale
+    file = scene.seed_points or views.points
     if isinstance(scene.poses, ColmapModel):
         file = file or points_file(scene.poses.folder)
     if file is not None:
         points, colors = (read_ply_points if file.suffix == ".ply" else read_colmap_points)(file)
-        transform = views.outputs.dataparser_transform
-        moved = (torch.from_numpy(points) @ transform[:, :3].T + transform[:, 3]) * scale
-        if bounds is None or _within_bounds(moved.numpy(), cameras, scale * bounds) > 0.9:
-            found = {"points3D_xyz": moved, "points3D_rgb": torch.from_numpy(colors)}
-        else:
+        moved = views.placing.points(points, original=isinstance(scene.poses, ColmapModel))
+        there = _seen_by_any(moved.numpy(), cameras)
+        if bounds is not None:
+            there = _within_bounds(moved.numpy(), cameras, scale * bounds) > 0.9
+        if len(points) and there:
+            if views.placing.origin is not None and (torn := _torn(points)) is not None:
+                say(f"The seed points {file} are {torn}: export them in double precision, or in local coordinates.")
+            return {"points3D_xyz": moved, "points3D_rgb": torch.from_numpy(colors), "points3D_random": False}
+        if len(points):
             say(f"{file} is not used: its points do not lie where the poses look.")
-    if found["points3D_xyz"] is not None and len(found["points3D_xyz"]) > 0:
-        return {**found, "points3D_random": False}
     if bounds is None:
         xyz, rgb = random_points(cameras, count)
     else:
@@ -123,6 +124,27 @@ def _within_bounds(points: np.ndarray, cameras: Sequence[Camera], bounds: np.nda
         inside = (x >= 0) & (x < camera.width * w) & (y >= 0) & (y < camera.height * w)
         found |= inside & (w > 0.9 * near) & (w < 1.1 * far)
     return float(found.mean()) if len(points) else 0.0
+
+
+def _seen_by_any(points: np.ndarray, cameras: Sequence[Camera]) -> bool:
+    """Return whether points [P, 3] may be of the scene: some lie near the cameras, or in the image of one."""
+    rotations, centers = _poses(cameras)
+    middle = centers.mean(0)
+    reach = float(np.linalg.norm(centers - middle, axis=1).max()) or 1.0
+    away = np.linalg.norm(points - middle, axis=1)
+    if not len(points) or (away < _FAR * reach).any():
+        return True
+    some = points[away < _TOO_FAR * reach]
+    some = some[:: max(1, len(some) // 2000)]
+    return bool((_share_of_views(some, rotations, centers, cameras) > 0).any())
+
+
+def _torn(points: np.ndarray) -> str | None:
+    """Describe points [P, 3] float64 far from 0 that were written in single precision; None for others."""
+    if not np.array_equal(points, points.astype(np.float32)):
+        return None
+    step = float(np.spacing(np.float32(np.abs(points).max())))
+    return f"in single precision, which at such coordinates has steps of {step:g}"
 
 
 def _point_of_interest(rotations: np.ndarray, centers: np.ndarray) -> np.ndarray:

@@ -26,14 +26,12 @@ def _dtu(path: Path) -> None:
 
 
 def _colmap(path: Path) -> object:
-    from nerfstudio.data.utils import colmap_parsing_utils as colmap
+    from beags_plugin.plugin.views.colmap_files import read_colmap_points
+    from beags_plugin.plugin.views.colmap_model import read_cameras, read_images
 
-    from beags_plugin.plugin.views.colmap_files import _read, read_colmap_points
-
-    kind = path.name.split(".")[0]
-    if kind == "points3D":
-        return read_colmap_points(path)
-    return _read(getattr(colmap, f"read_{kind}_binary"), path)
+    return {"points3D": read_colmap_points, "cameras": read_cameras, "images": read_images}[path.name.split(".")[0]](
+        path
+    )
 
 
 def _transforms(path: Path) -> None:

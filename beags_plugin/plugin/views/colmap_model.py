@@ -1,0 +1,146 @@
+"""COLMAP's models on disk, text and binary: cameras and images, in double precision.
+
+The counts that binary files promise are checked before memory of that size is taken.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from nerfstudio.data.utils import colmap_parsing_utils as colmap
+
+from beags_plugin.data.files import IMAGE_SUFFIXES
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.stand_ins import stand_in
+from beags_plugin.system.reading.text import read_text, reason
+
+Found = TypeVar("Found")
+_IMAGE = struct.Struct("<i7di")  # id, rotation wxyz, translation, id of the camera; a name and its features follow
+_FEATURE = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+_NAMED = re.compile(rf"^\d+(?:\s+\S+){{7}}\s+\d+\s+\S.*({'|'.join(map(re.escape, IMAGE_SUFFIXES))})$", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    """An image of a model: name as COLMAP wrote it, world-to-camera rotation wxyz [4] and translation [3], OpenCV.
+
+    xys: [N, 2] float64, pixels of its features; points: [N] int64, ids of their points, negative without one.
+    """
+
+    name: str
+    quaternion: np.ndarray
+    translation: np.ndarray
+    camera: int
+    xys: np.ndarray
+    points: np.ndarray
+
+
+def model_files(folder: Path) -> tuple[Path, Path]:
+    """Return the files of cameras and images of a complete model, in nerfstudio's order of looking."""
+    end = "txt" if (folder / "cameras.txt").is_file() else "bin"
+    return folder / f"cameras.{end}", folder / f"images.{end}"
+
+
+def read_cameras(file: Path) -> dict[int, Any]:
+    """Read cameras.bin or cameras.txt: nerfstudio's ``Camera`` by id; raises ``UserError``."""
+    return read(_cameras_text if file.suffix == ".txt" else colmap.read_cameras_binary, file)
+
+
+def read_images(file: Path) -> list[ColmapImage]:
+    """Read images.bin or images.txt in the order of ids; raises ``UserError``."""
+    found = read(_images_text if file.suffix == ".txt" else _images_binary, file)
+    return [found[index] for index in sorted(found)]
+
+
+def read(reader: Callable[[Path], Found], file: Path) -> Found:
+    """Return what ``reader`` makes of a file of a model; any failure of it becomes a ``UserError``."""
+    try:
+        return reader(file)
+    except UserError:
+        raise
+    # the readers let struct.error, IndexError and the like through
+    except Exception as error:
+        if (cause := stand_in(file)) is not None:
+            raise UserError(f"{file} cannot be read: {cause}.") from error
+        raise UserError(
+            f"{file} cannot be read ({type(error).__name__}: {reason(error)}): export the model again."
+        ) from error
+
+
+def lines_of(file: Path) -> Iterator[str]:
+    """Yield the lines of a text file of a model without comments; line ends of any system are cut off."""
+    lines = re.split(r"\r\n|\n|\r", read_text(file))  # not splitlines: names may hold what that takes for an end
+    return (line for line in lines if not line.lstrip().startswith("#"))
+
+
+def _cameras_text(file: Path) -> dict[int, Any]:
+    cameras = {}
+    for line in lines_of(file):
+        if words := line.split():
+            params = np.array([float(word) for word in words[4:]])
+            cameras[int(words[0])] = colmap.Camera(int(words[0]), words[1], int(words[2]), int(words[3]), params)
+    return cameras
+
+
+def _images_text(file: Path) -> dict[int, ColmapImage]:
+    """Read images.txt: the name is the rest of its line, and the line of features may be empty or absent."""
+    images, lines = {}, list(lines_of(file))
+    at = 0
+    while at < len(lines):
+        words = lines[at].split(maxsplit=9)
+        at += 1
+        if not words:
+            continue
+        if len(words) < 10:
+            raise ValueError(f"the line {lines[at - 1]!r:.60} is no image: id, rotation, translation, camera, name")
+        features: list[str] = []
+        if at < len(lines) and _NAMED.match(lines[at].strip()) is None:
+            features = lines[at].split()
+            at += 1
+        if len(features) % 3:
+            raise ValueError(f"the features of {words[9]} are no triples of x, y and a point's id")
+        table = np.array(features, np.float64).reshape(-1, 3)
+        images[int(words[0])] = ColmapImage(
+            words[9].strip(), np.array(words[1:5], np.float64), np.array(words[5:8], np.float64), int(words[8]),
+            table[:, :2], np.array([_point_id(word) for word in features[2::3]], np.int64),
+        )  # fmt: skip
+    return images
+
+
+def _point_id(word: str) -> int:
+    """Return the id of a point, -1 for none, which some programs write without a sign."""
+    return -1 if (point := int(word)) >= 1 << 63 else point
+
+
+def _images_binary(file: Path) -> dict[int, ColmapImage]:
+    content, at = file.read_bytes(), 8
+    (count,) = struct.unpack_from("<Q", content)
+    images = {}
+    for _ in range(count):
+        image_id, *values, camera = _IMAGE.unpack_from(content, at)
+        end = content.index(b"\0", at + _IMAGE.size)
+        name = _decoded(content[at + _IMAGE.size : end])
+        (length,) = struct.unpack_from("<Q", content, end + 1)
+        at = end + 9
+        if at + length * _FEATURE.itemsize > len(content):
+            raise ValueError("the file is cut off")
+        table = np.frombuffer(content, _FEATURE, length, at)
+        at += length * _FEATURE.itemsize
+        images[image_id] = ColmapImage(
+            name, np.array(values[:4]), np.array(values[4:]), camera, table["xy"], table["point"]
+        )
+    return images
+
+
+def _decoded(name: bytes) -> str:
+    """Return a name; those of Windows may be in its own code page."""
+    try:
+        return name.decode("utf-8")
+    except UnicodeDecodeError:
+        return name.decode("cp1252", "replace")
