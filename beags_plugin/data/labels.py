@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
-from beags_plugin.labels.classes import read_classes, read_id_mask
+from beags_plugin.labels.classes import palette_of, read_classes, read_id_mask
+from beags_plugin.labels.id_checks import check_ids, check_palettes
 from beags_plugin.system.errors import UserError
 
 
@@ -23,15 +24,18 @@ def read_class_names(
     """Return the class names by ascending id: of ``classes_file``, else ``known``, else ``class_<id>``.
 
     masks: id images, each read once. known, known_file: names of the layout, and their file.
-    Raises ``UserError`` if names are given but a mask holds an id without one.
+    Raises ``UserError`` if names are given but a mask holds an id without one, and for masks that look spoilt
+    (``labels.id_checks``).
     """
 
     def ids_in(mask: Path) -> set[int]:
-        counts = np.bincount(read_id_mask(mask, ignore_ids).ravel(), minlength=IGNORE + 1)
-        return set(np.flatnonzero(counts).tolist()) - {IGNORE}
+        labels = read_id_mask(mask, ignore_ids)
+        check_ids(mask, labels)
+        return set(np.flatnonzero(np.bincount(labels.ravel(), minlength=IGNORE + 1)).tolist()) - {IGNORE}
 
     with ThreadPoolExecutor(max_workers=4) as pool:  # decoding a .png releases the interpreter
         ids_of_masks = list(pool.map(ids_in, masks))
+        check_palettes(masks, list(pool.map(palette_of, masks)))
     if classes_file.is_file():
         classes, source = read_classes(classes_file), classes_file
     elif known is not None:

@@ -139,6 +139,7 @@ def missing_note(missing: Sequence[Path], total: int, source: Path, strict: bool
     what = f"{count} of the {total} photos that {source} names {are} missing"
     first = "" if len(missing) == 1 else "the first of them "
     if strict or 2 * len(missing) > total:
-        raise UserError(f"{what}, {first}{missing[0]}: restore them, or name their folder with --images-path.")
+        them = "it" if len(missing) == 1 else "them"
+        raise UserError(f"{what}, {first}{missing[0]}: restore {them}, or name the folder with --images-path.")
     it = "it is" if len(missing) == 1 else "they are"
     return f"{what}, {first}{missing[0]}: {it} left out (beags-data --strict True refuses instead)."

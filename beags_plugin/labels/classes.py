@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +14,9 @@ from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.reading.images import read_image
 from beags_plugin.system.reading.text import load_json, reason
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 NO_TRUTH = "no_truth.json"
 """In a folder of masks: a program drew those of all views, so that held-out ones are no truth to evaluate with."""
@@ -25,15 +30,21 @@ _COLOR_MODES = {"RGB", "RGBA", "LA"}
 
 def read_id_mask(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarray:
     """Read class ids [H, W] uint16 from an 8-bit grey, 16-bit grey or palette image (its indices, not its colours).
-
     ignore_ids: ids of an 8-bit image that mean "unlabelled", e.g. 255; they become IGNORE (65535).
     Raises ``UserError`` for any other file.
     """
     mode, values = _read_pixels(path)
-    if mode not in _ID_MODES or values.ndim != 2:
+    if mode in _COLOR_MODES and _is_grey(mode, values):
         raise UserError(
-            f"the mask {path} has colours (mode {mode}) where class ids are needed: save it as 8-bit or 16-bit grey, "
-            "or as a palette PNG."
+            f"the mask {path} has colours (mode {mode}), though all are greys, where class ids are needed: save it with "
+            "one channel, as 8-bit grey PNG."
+        )
+    if mode not in _ID_MODES or values.ndim != 2:
+        folder = shlex.quote(str(Path(path).parent))
+        raise UserError(
+            f"the mask {path} has colours (mode {mode}) where class ids are needed: save it as 8-bit or 16-bit grey "
+            "PNG, or let each colour become an id with beags masks make --source id-images --options "
+            f"folder={folder} colors=true."
         )
     if values.min(initial=0) < 0 or values.max(initial=0) > IGNORE:
         raise UserError(f"the mask {path} holds ids outside 0..{IGNORE}: save it as 8-bit or 16-bit grey PNG.")
@@ -41,6 +52,29 @@ def read_id_mask(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarray
     if mode in {"1", "L", "P"}:
         labels[np.isin(labels, list(ignore_ids))] = IGNORE
     return labels
+
+
+def _is_grey(mode: str, values: np.ndarray) -> bool:
+    """Return whether a colour image has equal channels, and alpha, if any, of one value."""
+    alpha, colors = values[..., -1:], values[..., : 1 if mode == "LA" else 3]
+    opaque = mode == "RGB" or bool((alpha == alpha.flat[0]).all())
+    return opaque and bool((colors == colors[..., :1]).all())
+
+
+def palette_of(path: Path | str) -> dict[int, tuple[int, int, int]] | None:
+    """Return the colours of the ids in a palette image; None for another image and for a palette of greys by value."""
+
+    def read(image: Image) -> dict[int, tuple[int, int, int]] | None:
+        if image.mode != "P" or image.palette is None:
+            return None
+        used = np.unique(np.asarray(image)).tolist()
+        colors = np.zeros((256, 3), np.uint8)
+        given = np.array(image.convert("P").getpalette("RGB") or [], np.uint8).reshape(-1, 3)
+        colors[: len(given)] = given[:256]
+        found = {index: tuple(int(value) for value in colors[index]) for index in used}
+        return None if all(color == (index,) * 3 for index, color in found.items()) else found  # type: ignore[return-value]
+
+    return read_image(path, read, "the mask", "save it as PNG again")
 
 
 def read_object_mask(path: Path | str, truth: bool = False) -> np.ndarray:

@@ -13,8 +13,8 @@ import numpy as np
 from beags_plugin.posing.photos import FEWEST, Look, look_at
 from beags_plugin.system.digests import content_digest
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.stand_ins import stand_in
 from beags_plugin.system.progress import Bar, counted
+from beags_plugin.system.reading.stand_ins import stand_in
 from beags_plugin.system.whole_files import write_text_atomically, write_whole
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")

@@ -22,15 +22,15 @@ from beags_plugin.system.reading.text import load_json
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1\nsize 12345\n"
 PAGE = b"\xef\xbb\xbf\n<!-- saved -->\n<!DOCTYPE HTML><html><head><title>Sign in</title></head></html>"
 STAND_INS = {
-    "a pointer of Git LFS": (LFS, "a pointer of Git LFS.*: run git lfs pull"),
-    "a pointer of git-annex": (b"/annex/objects/SHA256E-s9--ab.ply\n", "a pointer of git-annex.*: run git annex get"),
-    "a web page": (PAGE, "a web page.*: open the link in a browser"),
-    "a plain web page": (b"<html><body>404</body></html>", "a web page.*: open the link in a browser"),
+    "a pointer of Git LFS": (LFS, "a pointer of Git LFS.*run git lfs pull"),
+    "a pointer of git-annex": (b"/annex/objects/SHA256E-s9--ab.ply\n", "a pointer of git-annex.*run git annex get"),
+    "a web page": (PAGE, "a web page.*open the link in a browser"),
+    "a plain web page": (b"<html><body>404</body></html>", "a web page.*open the link in a browser"),
     "a server's error": (
         b'<?xml version="1.0"?>\n<Error><Code>AccessDenied</Code></Error>',
         "error message of the ser",
     ),
-    "an empty file": (b"", "it is empty.*: get it again"),
+    "an empty file": (b"", "it is empty.*get it again"),
 }
 
 

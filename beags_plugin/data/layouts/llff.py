@@ -97,7 +97,7 @@ def camera_names(root: Path, folder: Path) -> dict[str, str]:
 
 
 def _columns(line: str) -> list[str]:
-    """Return the name of a copy and that of the camera's file, the rest of the line; parted by a tab, if there is one."""
+    """Return the name of a copy and that of the camera's file, the rest of the line; a tab parts them, if any."""
     return [name.strip() for name in (line.split("\t", 1) if "\t" in line else line.split(maxsplit=1))]
 
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from beags_plugin.data.files import IMAGE_SUFFIXES, image_size
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
-from beags_plugin.labels.classes import read_mask
+from beags_plugin.labels.classes import palette_of, read_mask
+from beags_plugin.labels.id_checks import check_ids, check_palettes
 from beags_plugin.masks.check.issues import STOPS, Issue, named, percent
 from beags_plugin.system.errors import UserError
 
@@ -88,6 +89,8 @@ def check_files(
             if size != tuple(files.sizes[view]):
                 return _wrong_size(files, view, size)
             labels = files.read(view)
+            if files.kind == "ids" and labels is not None:
+                check_ids(path, labels)
         except UserError as error:
             return Issue("error", "type", str(error), STOPS, (files.stems[view],))
         assert labels is not None
@@ -104,11 +107,22 @@ def check_files(
                 counts[view] = found
             if progress:
                 progress(view + 1, views)
+        issues += _palettes(files, [view for view, found in enumerate(counts) if found is not None], pool)
     coverage = _coverage(counts)
     coverage.issues += issues
     coverage.issues += [*_missing(files), *_no_object(files, coverage), *_strays(files), *_names(files, coverage)]
     coverage.issues += [*_few_views(files, coverage, few_views), *_unlabelled(files, coverage)]
     return coverage
+
+
+def _palettes(files: MaskFiles, views: Sequence[int], pool: ThreadPoolExecutor) -> list[Issue]:
+    masks = [path for view in views if (path := files.masks[view]) is not None]
+    try:
+        if files.kind == "ids":
+            check_palettes(masks, list(pool.map(palette_of, masks)))
+    except UserError as error:
+        return [Issue("error", "type", str(error), STOPS)]
+    return []
 
 
 def _coverage(counts: Sequence[Mapping[int, int] | None]) -> Coverage:

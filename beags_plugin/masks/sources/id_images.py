@@ -10,6 +10,7 @@ import numpy as np
 
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import read_classes, read_id_mask
+from beags_plugin.labels.id_checks import check_areas, check_ids
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo
 from beags_plugin.masks.sources.matching import files_by_name
 from beags_plugin.system.errors import UserError
@@ -57,7 +58,9 @@ class IdImagesSource(MaskSource):
 
     def _ids(self, path: Path, palette: dict[int, int]) -> np.ndarray:
         if not self.colors:
-            return read_id_mask(path, self.ignore_ids)
+            labels = read_id_mask(path, self.ignore_ids)
+            check_ids(path, labels)
+            return labels
         form, pixels = read_image(
             path,
             lambda image: (image.format, np.asarray(image.convert("RGB")).astype(np.uint32)),
@@ -68,13 +71,15 @@ class IdImagesSource(MaskSource):
             raise UserError(f"the mask {path} is a JPEG, which blurs the colours of objects: save it as PNG.")
         packed = pixels[..., 0] << 16 | pixels[..., 1] << 8 | pixels[..., 2]
         colors, inverse = np.unique(packed, return_inverse=True)
+        inverse = inverse.reshape(packed.shape)
+        check_areas(path, inverse, "colours")
         for color in colors.tolist():
             if color and len(palette) >= IGNORE - 1:
                 raise UserError(f"{path} and those before it hold more than {IGNORE - 1} colours: it is no id image.")
             if color:
                 palette.setdefault(color, len(palette) + 1)
         ids = np.array([palette.get(color, 0) for color in colors.tolist()], np.uint16)
-        return ids[inverse.reshape(packed.shape)]
+        return ids[inverse]
 
 
 @dataclass(frozen=True)

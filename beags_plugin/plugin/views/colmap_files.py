@@ -96,7 +96,7 @@ def _binary_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
     points: dict[int, tuple[float, ...]] = {}
     for _ in range(count):
         if offset + _POINT.size > len(content):
-            raise ValueError("the file is cut off")
+            raise struct.error
         point_id, *values, length = _POINT.unpack_from(content, offset)
         points[point_id] = tuple(values[:6])
         offset += _POINT.size + 8 * length  # its track follows

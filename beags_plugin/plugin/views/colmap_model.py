@@ -68,6 +68,8 @@ def read(reader: Callable[[Path], Found], file: Path) -> Found:
     except Exception as error:
         if (cause := stand_in(file)) is not None:
             raise UserError(f"{file} cannot be read: {cause}.") from error
+        if isinstance(error, struct.error):
+            raise UserError(f"{file} cannot be read (the file is cut off): export the model again.") from error
         raise UserError(
             f"{file} cannot be read ({type(error).__name__}: {reason(error)}): export the model again."
         ) from error
@@ -129,7 +131,7 @@ def _images_binary(file: Path) -> dict[int, ColmapImage]:
         (length,) = struct.unpack_from("<Q", content, end + 1)
         at = end + 9
         if at + length * _FEATURE.itemsize > len(content):
-            raise ValueError("the file is cut off")
+            raise struct.error
         table = np.frombuffer(content, _FEATURE, length, at)
         at += length * _FEATURE.itemsize
         images[image_id] = ColmapImage(

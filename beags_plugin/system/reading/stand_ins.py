@@ -31,15 +31,15 @@ def stand_in(path: Path | str) -> str | None:
 def of_bytes(head: bytes, name: str) -> str | None:
     """Return what ``stand_in`` does for the first bytes of a file called ``name``."""
     if not head:
-        return "it is empty, as after a download that broke off: get it again"
+        return "it is empty, as after a download that broke off; get it again"
     if head.startswith(_LFS):
-        return "it is a pointer of Git LFS, not the file itself: run git lfs pull in its folder"
+        return "it is a pointer of Git LFS, not the file itself; run git lfs pull in its folder"
     if _ANNEX.match(head):
-        return f"it is a pointer of git-annex, not the file itself: run git annex get {_quoted(name)} in its folder"
+        return f"it is a pointer of git-annex, not the file itself; run git annex get {_quoted(name)} in its folder"
     if _PAGE.match(head.removeprefix(b"\xef\xbb\xbf")):
-        return "it is a web page, not the file itself: open the link in a browser and download the file"
+        return "it is a web page, not the file itself; open the link in a browser and download the file"
     if _XML.match(head):
-        return "it is an error message of the server, not the file itself: download it again"
+        return "it is an error message of the server, not the file itself; download it again"
     return None
 
 

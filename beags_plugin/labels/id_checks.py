@@ -1,0 +1,115 @@
+"""Signs that an image of class ids was spoilt: smoothed, compressed with loss, or saved with palettes that differ."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.system.errors import UserError
+
+LEAST_RAMPS = 12  # outlines crossed by rows and columns over a value between: fewer may be chance
+RAMPS = 0.3  # share of crossings with a value between; thin objects have few, a smoothed mask of ids 0 and 2 has half
+LEAST_SOLID = 0.2  # share of pixels amid 3 x 3 of one id: less is noise, which has no outlines
+MOST_DUST = 8  # ids that fill no area of 3 x 3 pixels, but lie about in so many pieces each:
+PIECES = 4
+MOST_IN_DUST = 0.5  # share of all pixels in ids that fill no area: more is a picture
+
+_COLORS = "beags masks make --source id-images --options folder=FOLDER colors=true"
+
+
+def check_ids(path: Path | str, labels: np.ndarray) -> None:
+    """Raise ``UserError`` for labels [H, W] of a file that look smoothed or compressed with loss."""
+    found = np.unique(labels)
+    if len(found) < 3 or min(labels.shape) < 3:
+        return
+    if (between := _ramps(labels)) is not None and _solid(labels).mean() >= LEAST_SOLID:
+        raise UserError(
+            f"the mask {path} has values between its ids along outlines ({_listed(between)}), as scaling with "
+            "smoothing or antialiasing leaves them: scale id images by nearest neighbour, or make them anew."
+        )
+    check_areas(path, labels, "values")
+
+
+def check_areas(path: Path | str, labels: np.ndarray, what: str) -> None:
+    """Raise ``UserError`` for labels [H, W] with many ids that fill no area; what: the user's word for ids."""
+    if min(labels.shape) < 3:
+        return
+    counts = np.bincount(labels.ravel())
+    areas = np.bincount(labels[1:-1, 1:-1][_solid(labels)], minlength=len(counts))
+    fine = (counts > 0) & (areas == 0)
+    share = counts[fine].sum() / labels.size
+    if what == "colours" and fine.sum() > 256 and share >= MOST_IN_DUST:
+        raise UserError(f"the mask {path} is a picture of {fine.sum()} colours: give images of one colour per object.")
+    corner = np.ones(labels.shape, bool)  # pixels without the same id to the left and above: one or two a piece
+    corner[:, 1:] &= labels[:, 1:] != labels[:, :-1]
+    corner[1:] &= labels[1:] != labels[:-1]
+    pieces = np.bincount(labels[corner], minlength=len(counts))
+    dust = np.flatnonzero(fine & (pieces >= PIECES)).tolist()
+    if len(dust) >= max(MOST_DUST, np.count_nonzero(areas)) and share < MOST_IN_DUST:
+        listed = f" ({_listed(dust)})" if what == "values" else ""
+        raise UserError(
+            f"the mask {path} has {len(dust)} {what} that fill no area{listed}, as compression with loss (JPEG), "
+            "smoothing or antialiasing leaves them along outlines: make it anew without, and save it as PNG."
+        )
+
+
+def _ramps(labels: np.ndarray) -> list[int] | None:
+    """Return the ids that lie between others along most outlines; None where outlines are hard."""
+    values = labels.astype(np.int32)
+    crossings = ramps = 0
+    seen: set[int] = set()
+    for image in (values, values.T):
+        jump = np.diff(image, axis=1)
+        jump[(image[:, 1:] == IGNORE) | (image[:, :-1] == IGNORE)] = 0
+        step = np.sign(jump)
+        goes_on = (step[:, 1:] == step[:, :-1]) & (step[:, 1:] != 0)  # the pixel between lies between in value too
+        first, last = step != 0, step != 0
+        first[:, 1:] &= ~goes_on
+        last[:, :-1] &= ~goes_on
+        crossings += int((first & ~last).sum() + (first & last & (np.abs(jump) >= 2)).sum())
+        ramps += int((first & ~last).sum())
+        seen.update(np.unique(image[:, 1:-1][goes_on]).tolist())
+    if ramps < LEAST_RAMPS or ramps < RAMPS * crossings:
+        return None
+    return sorted(seen)
+
+
+def _solid(labels: np.ndarray) -> np.ndarray:
+    """Return which pixels [H - 2, W - 2], without the rim, lie amid 3 x 3 of one id."""
+    middle = labels[1:-1, 1:-1]
+    same = np.ones(middle.shape, bool)
+    for row in range(3):
+        for column in range(3):
+            same &= labels[row : row + middle.shape[0], column : column + middle.shape[1]] == middle
+    return same
+
+
+def check_palettes(masks: Sequence[Path], palettes: Sequence[Mapping[int, tuple[int, int, int]] | None]) -> None:
+    """Raise ``UserError`` where palette images give one colour different ids, or black another id than the background.
+
+    palettes: of each mask the colours of the ids in it; None where it has no palette, or one of greys.
+    """
+    known: dict[tuple[int, int, int], tuple[int, Path]] = {}
+    for path, palette in zip(masks, palettes, strict=True):
+        if palette is None or len(set(palette.values())) < len(palette):
+            continue
+        for index, color in palette.items():
+            former, other = known.setdefault(color, (index, path))
+            if former != index:
+                raise UserError(
+                    f"the palette images {other} and {path} give the colour {color} the ids {former} and {index}, but "
+                    f"ids are the places in the palette: save all with one palette, or read the colours with {_COLORS}."
+                )
+            if color == (0, 0, 0) and index != 0 and 0 in palette:
+                raise UserError(
+                    f"the palette image {path} has black as id {index} and the colour {palette[0]} as id 0, which is "
+                    f"the background: put black first in the palette, or read the colours with {_COLORS}."
+                )
+
+
+def _listed(ids: Sequence[int]) -> str:
+    shown = ", ".join(map(str, ids[:5]))
+    return f"{shown}, ..." if len(ids) > 5 else shown
