@@ -122,6 +122,8 @@ class Make:
     """Replace masks that are there already."""
     snap: int = 0
     """Move boundaries to edges of the photo, by at most this many pixels; 0 leaves them."""
+    upright: bool = False
+    """The source's masks are of upright photos: turn them as the photos are stored (EXIF orientation)."""
     layout: str = "auto"
     """How the data set lays out its files (docs/data.md); auto recognises it."""
     images_path: Path | None = None
@@ -135,7 +137,7 @@ class Make:
             from beags_plugin.plugin.objects.make_masks import configured_source, make_masks
         source = configured_source(self.source, self.options)
         data = data_options(self.data, self.layout, self.images_path)
-        for line in make_masks(data, source, self.load_config, self.output, self.overwrite, self.snap):
+        for line in make_masks(data, source, self.load_config, self.output, self.overwrite, self.snap, self.upright):
             CONSOLE.print(line)
 
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from beags_plugin.data.orientation import upright_mask_error
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.images import read_image
 
@@ -184,10 +185,17 @@ def same_proportions(size: tuple[int, int], other: tuple[int, int]) -> bool:
     return abs(expected - other_height) <= 1.0 + expected / other_width
 
 
-def check_same_size(masks: Sequence[Path | None], sizes: Sequence[tuple[int, int]]) -> None:
-    """Raise ``UserError`` for the first mask that differs in size from its image (width, height)."""
-    for mask, (width, height) in zip(masks, sizes, strict=True):
+def check_same_size(
+    masks: Sequence[Path | None], sizes: Sequence[tuple[int, int]], images: Sequence[Path] | None = None
+) -> None:
+    """Raise ``UserError`` for the first mask that differs in size from its image (width, height).
+
+    images: the files, whose EXIF may say that they are stored on their side.
+    """
+    for index, (mask, (width, height)) in enumerate(zip(masks, sizes, strict=True)):
         if mask is not None and (found := image_size(mask, "the mask")) != (width, height):
+            if images and (sentence := upright_mask_error(mask, found, images[index], (width, height))):
+                raise UserError(sentence)
             raise UserError(
                 f"the mask {mask} is {found[0]}x{found[1]} pixels but its image is {width}x{height}: "
                 f"make the mask from that image, or name images of its size with beags-data --images-path."

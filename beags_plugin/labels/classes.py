@@ -36,8 +36,8 @@ def read_id_mask(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarray
     mode, values = _read_pixels(path)
     if mode in _COLOR_MODES and _is_grey(mode, values):
         raise UserError(
-            f"the mask {path} has colours (mode {mode}), though all are greys, where class ids are needed: save it with "
-            "one channel, as 8-bit grey PNG."
+            f"the mask {path} has colours (mode {mode}), though all are greys, where class ids are needed: save it "
+            "with one channel, as 8-bit grey PNG."
         )
     if mode not in _ID_MODES or values.ndim != 2:
         folder = shlex.quote(str(Path(path).parent))

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from beags_plugin.data.files import IMAGE_SUFFIXES, image_size
+from beags_plugin.data.orientation import turned_note, upright_mask_error
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.labels.classes import palette_of, read_mask
 from beags_plugin.labels.id_checks import check_ids, check_palettes
@@ -27,7 +28,7 @@ class MaskFiles:
 
     stems: names of the V images (``data.files.photo_names``); sizes: (width, height) of their files; masks: file or
     None. folder: of the masks. kind, ignore_ids: see ``labels.classes.read_mask``. trained: False for held-out views.
-    names: id to name from the user or the layout, or None; names_file: their file.
+    names: id to name from the user or the layout, or None; names_file: their file. photos: the files of the views.
     """
 
     stems: Sequence[str]
@@ -39,6 +40,7 @@ class MaskFiles:
     trained: Sequence[bool]
     names: Mapping[int, str] | None
     names_file: Path
+    photos: Sequence[Path] = ()
 
     def read(self, view: int) -> np.ndarray | None:
         """Read [H, W] uint16 class ids or IGNORE of a view; None without a mask; raise ``UserError``."""
@@ -111,6 +113,10 @@ def check_files(
     coverage = _coverage(counts)
     coverage.issues += issues
     coverage.issues += [*_missing(files), *_no_object(files, coverage), *_strays(files), *_names(files, coverage)]
+    if any(files.masks) and (sentence := turned_note(files.photos)) is not None:
+        coverage.issues.append(
+            Issue("note", "stored turned", sentence, "upright masks would lie wrong in the photos, unnoticed")
+        )
     coverage.issues += [*_few_views(files, coverage, few_views), *_unlabelled(files, coverage)]
     return coverage
 
@@ -135,6 +141,11 @@ def _coverage(counts: Sequence[Mapping[int, int] | None]) -> Coverage:
 
 def _wrong_size(files: MaskFiles, view: int, found: tuple[int, ...]) -> Issue:
     width, height = files.sizes[view]
+    mask = files.masks[view]
+    if files.photos and mask is not None:
+        sentence = upright_mask_error(mask, (found[0], found[1]), files.photos[view], (width, height))
+        if sentence is not None:
+            return Issue("error", "size", sentence, STOPS, (files.stems[view],))
     return Issue(
         "error",
         "size",

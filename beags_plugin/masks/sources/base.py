@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, Protocol
@@ -13,6 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.data.orientation import LYING, orientation, upright, upright_mask_error
 from beags_plugin.masks.sources.matching import PhotoNames
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.images import read_image
@@ -26,18 +27,28 @@ class NothingFound(UserError):
 
 @dataclass(frozen=True)
 class Photo:
-    """A view: its name (``data.files.photo_names``), its file, its size in pixels; trained: not held out."""
+    """A view: its name (``data.files.photo_names``), its file, its size in pixels; trained: not held out.
+
+    turned: EXIF's orientation of the file where masks are made of upright photos, whose size and pixels these are.
+    """
 
     name: str
     path: Path
     width: int
     height: int
     trained: bool = True
+    turned: int = 1
 
     def pixels(self) -> np.ndarray:
         """Read [H, W, 3] uint8 RGB."""
         # a copy: torch needs writable memory
-        return read_image(self.path, lambda image: np.array(image.convert("RGB")))
+        return upright(read_image(self.path, lambda image: np.array(image.convert("RGB"))), self.turned)
+
+    def upright(self) -> Photo:
+        """Return the photo as EXIF says that one holds it."""
+        turned = orientation(self.path)
+        sides = (self.height, self.width) if turned in LYING else (self.width, self.height)
+        return replace(self, width=sides[0], height=sides[1], turned=turned)
 
 
 class Geometry(Protocol):
@@ -149,6 +160,9 @@ def per_photo(
     for index, photo in enumerate(scene.photos):
         labels = read(photo)
         if labels is not None and labels.shape != (photo.height, photo.width):
+            size = labels.shape[1], labels.shape[0]
+            if sentence := upright_mask_error("made here", size, photo.path, (photo.width, photo.height)):
+                raise UserError(sentence)
             raise UserError(
                 f"the masks of {photo.path} are {labels.shape[1]}x{labels.shape[0]} pixels but the image is "
                 f"{photo.width}x{photo.height}: make them from the image at its full size."

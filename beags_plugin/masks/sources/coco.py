@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from beags_plugin.data.orientation import upright_mask_error
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo, stacked
 from beags_plugin.system.errors import UserError
@@ -35,6 +36,7 @@ class CocoSource(MaskSource):
         try:
             content = load_json(path)
             views = {image["id"]: str(image["file_name"]) for image in content["images"]}
+            sizes = {str(image["file_name"]): (image.get("width"), image.get("height")) for image in content["images"]}
             categories = {entry["id"]: str(entry["name"]) for entry in content.get("categories", [])}
             annotations = [(views[entry["image_id"]], self._key(entry), entry) for entry in content["annotations"]]
         except OSError as error:
@@ -62,6 +64,10 @@ class CocoSource(MaskSource):
             if photo.name not in annotated:
                 return None
             shape = (photo.height, photo.width)
+            if sentence := upright_mask_error(
+                f"of {photo.name} in {path}", sizes[annotated[photo.name]], photo.path, (photo.width, photo.height)
+            ):
+                raise UserError(sentence)
             whole: dict[int, np.ndarray] = {}  # an object may have several annotations
             for class_id, segmentation in of_view[annotated[photo.name]]:
                 mask = decoded(segmentation, shape, f"{path}, image {photo.name}")

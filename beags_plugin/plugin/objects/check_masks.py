@@ -188,6 +188,7 @@ def _files(config: BeagsDataParserConfig) -> tuple[Dataset, PosedViews, MaskFile
         [view in trained for view in range(len(masks))],
         names,
         names_file if names_file.is_file() else scene.class_names_file or names_file,
+        views.images,
     )
     return scene, views, files
 

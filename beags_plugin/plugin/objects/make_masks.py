@@ -18,6 +18,7 @@ from torch import Tensor
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.data.files import image_size, list_photos, photo_names
 from beags_plugin.data.layout import fitting_layouts
+from beags_plugin.data.orientation import as_stored
 from beags_plugin.extraction.frames import to_input_frame
 from beags_plugin.labels.classes import NO_TRUTH, check_names, write_mask
 from beags_plugin.masks.snapping import snap_to_edges
@@ -121,6 +122,7 @@ def make_masks(
     output: Path | None = None,
     overwrite: bool = False,
     snap: int = 0,
+    upright: bool = False,
 ) -> list[str]:
     """Write the masks of a scene: <output>/masks/<stem>.png, classes.json and made.png, a picture of them.
 
@@ -128,6 +130,7 @@ def make_masks(
     <output>/masks_to_look_at/, which nothing reads. data: names the scene. run: config.yml of a run trained on it, for
     sources that need its depth. output: the scene's own folder if None, where ``beags-data`` looks for them. overwrite:
     replace existing masks. snap: radius in pixels of ``masks.snapping.snap_to_edges``; 0 leaves boundaries as they are.
+    upright: the source's masks are of photos as EXIF says that one holds them; they are turned as these are stored.
     Returns lines that report the written files, and what ``beags masks check`` finds in them. Raises ``UserError``
     before anything is written, or for bad input.
     """
@@ -149,6 +152,10 @@ def make_masks(
         Photo(name, path, *size, trained=index in trained)
         for index, (name, path, size) in enumerate(zip(photo_names(images), images, sizes, strict=True))
     ]
+    if upright:
+        if source.needs_run:
+            raise UserError("this mask source looks at the photos as they are stored: leave --upright out.")
+        photos = [photo.upright() for photo in photos]
     made_of = SourceScene(root, photos, RunGeometry(run, data.data) if run is not None and source.needs_run else None)
     shares: list[float] = []
     shown: list[tuple[Photo, Path]] = []
@@ -167,13 +174,16 @@ def make_masks(
                 continue
             if snap:
                 labels = snap_to_edges(labels, photos[index].pixels(), snap)
+            labels = as_stored(labels, photos[index].turned)
             place = look_at if index in made.to_look_at else masks
             file = unfinished[place] / path
             file.parent.mkdir(parents=True, exist_ok=True)
             write_mask(file, labels)
             if place is masks:
                 shares.append(float((labels != 0).mean()))
-            shown.append((photos[index], place / path))
+            shown.append(
+                (replace(photos[index], turned=1, width=labels.shape[1], height=labels.shape[0]), place / path)
+            )
         if not shares:
             raise UserError("the mask source gave no mask for any view: check its options.")
         if not any(shares):

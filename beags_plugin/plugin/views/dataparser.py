@@ -21,6 +21,7 @@ from beags_plugin.data.files import check_same_size, files_of_views, image_size
 from beags_plugin.data.ground_truth import find_ground_truth, of_views, stray_note
 from beags_plugin.data.labels import read_class_names
 from beags_plugin.data.layout import read_dataset
+from beags_plugin.data.orientation import sideways_photo_error
 from beags_plugin.data.split import split_views
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import NO_TRUTH
@@ -193,7 +194,7 @@ class BeagsDataParser(DataParser):
                 f"no mask in {folder} has the name of an image ({views.images[0].stem}.png, ...): "
                 f"rename the masks, or give another masks_path."
             )
-        check_same_size(masks, sizes)
+        check_same_size(masks, sizes, views.images)
         present = [mask for mask in masks if mask is not None and kind == "ids"]
         truth = (scene.root / config.ground_truth_path, views.images, images_root(scene))
         classes_file = scene.root / config.classes_path
@@ -226,6 +227,8 @@ class BeagsDataParser(DataParser):
             # A smaller copy of the images rounds each side by up to a pixel; more is another picture.
             expected = width * camera_height / camera_width
             if abs(expected - height) > 1.0 + expected / width:
+                if sentence := sideways_photo_error(path, (width, height), (camera_width, camera_height)):
+                    raise UserError(sentence)
                 raise UserError(
                     f"the image {path} is {width}x{height} pixels but its camera is {camera_width}x{camera_height}: "
                     f"use the images that the poses were made from."

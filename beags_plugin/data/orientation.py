@@ -1,0 +1,96 @@
+"""Photos that are stored turned, with EXIF's word on how to hold them: images and masks between the two ways."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.images import read_image
+
+TAG = 274  # EXIF's tag of the orientation
+LYING = (5, 6, 7, 8)  # its values that swap width and height
+
+
+def orientation(path: Path) -> int:
+    """Return EXIF's orientation of a photo, 1 (upright) to 8; 1 without one, and for a photo that cannot be read."""
+    try:
+        found = read_image(path, lambda image: image.getexif().get(TAG, 1))
+    except (UserError, FileNotFoundError):
+        return 1
+    return found if found in range(1, 9) else 1
+
+
+def upright(image: np.ndarray, turned: int) -> np.ndarray:
+    """Return an image [H, W, ...] that is stored with EXIF's orientation ``turned`` as one holds it."""
+    return _turned(image, turned, -1)
+
+
+def as_stored(image: np.ndarray, turned: int) -> np.ndarray:
+    """Undo ``upright``."""
+    return _turned(image, turned, 1)
+
+
+def _turned(image: np.ndarray, turned: int, quarter: int) -> np.ndarray:
+    found = {
+        1: lambda: image,
+        2: lambda: image[:, ::-1],
+        3: lambda: image[::-1, ::-1],
+        4: lambda: image[::-1],
+        5: lambda: image.swapaxes(0, 1),
+        6: lambda: np.rot90(image, quarter),
+        7: lambda: image[::-1, ::-1].swapaxes(0, 1),
+        8: lambda: np.rot90(image, -quarter),
+    }[turned]()
+    return np.ascontiguousarray(found)
+
+
+def upright_mask_error(mask: Path | str, size: tuple[int, int], photo: Path, photo_size: tuple[int, int]) -> str | None:
+    """Return a sentence about a mask whose sides are those of its photo swapped; None unless EXIF turns the photo.
+
+    mask: its file, or a word for it. size, photo_size: (width, height), the photo's as it is stored.
+    """
+    if size != photo_size[::-1] or size == photo_size or (turned := orientation(photo)) not in LYING:
+        return None
+    folder = shlex.quote(str(Path(mask).parent)) if isinstance(mask, Path) else "FOLDER"
+    return (
+        f"the mask {mask} is upright, {size[0]}x{size[1]} pixels, but its photo {photo} is stored on its side, "
+        f"{photo_size[0]}x{photo_size[1]} with EXIF orientation {turned}: turn the masks with beags masks make "
+        f"--upright --overwrite --source id-images --options folder={folder} --data FOLDER."
+    )
+
+
+def sideways_photo_error(photo: Path, size: tuple[int, int], camera: tuple[int, int]) -> str | None:
+    """Return a sentence about poses that were made of upright photos; None unless EXIF turns this one."""
+    if size == camera or size != camera[::-1] or (turned := orientation(photo)) not in LYING:
+        return None
+    return (
+        f"the image {photo} is stored on its side, {size[0]}x{size[1]} pixels with EXIF orientation {turned}, but its "
+        f"camera is upright, {camera[0]}x{camera[1]}: turn the photos, e.g. with exiftran -ai or mogrify -auto-orient, "
+        "in a copy of their folder."
+    )
+
+
+def turned_note(photos: Sequence[Path]) -> str | None:
+    """Return a sentence about photos that are stored turned, whose masks may be upright unnoticed; None without any.
+
+    Only orientations that keep the photo's size pass unnoticed: upside down, mirrored, or on its side in a square.
+    """
+    found = []
+    for photo in photos:
+        turned = orientation(photo)
+        if turned == 1:
+            continue
+        size = read_image(photo, lambda image: image.size)
+        if turned not in LYING or size[0] == size[1]:
+            found.append((photo, turned))
+    if not found:
+        return None
+    photo, turned = found[0]
+    return (
+        f"{len(found)} photos are stored turned, the first of them {photo} with EXIF orientation {turned}: masks must "
+        "lie as the photos are stored; turn upright ones with beags masks make --upright."
+    )
