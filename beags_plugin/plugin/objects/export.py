@@ -18,9 +18,10 @@ from beags_plugin.export.frames import Frame, check_placement
 from beags_plugin.export.mesh import open3d_missing
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.pose_options import PoseOptions
+from beags_plugin.extraction.far_worlds import local_origin, said_of_far, to_world, write_origin
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.plugin.objects.export_job import ExportJob, Progress, Shown, Steps
-from beags_plugin.plugin.objects.exported import Exported
+from beags_plugin.plugin.objects.exported import Exported, ExportedFile
 from beags_plugin.plugin.objects.extract import (
     empty_objects,
     file_name,
@@ -107,11 +108,14 @@ def export_run(
     metres = None
     if (length := pose.length()) is not None:
         metres = metres_per_unit(length, config_path, frame, scene)
+    origin = local_origin(*transform) if transform is not None else None
+    posed = placement == "object" or pose != PoseOptions()
     shown = Shown(scene, config_path)
     cleaner = None if keep_all or not any(map(present.get, names)) else shown.cleaner()
     job = ExportJob(
-        scene, exporters, frame, metres, placement == "object", pose, views, everything, cleaner, shown, closing
-    )
+        scene, exporters, frame, metres, placement == "object", pose, views, everything, cleaner, shown, closing,
+        None if origin is None else frame.centred(origin), None if posed else origin,
+    )  # fmt: skip
     items: list[tuple[str, int | None, str]] = [(name, present[name], titles[present[name]]) for name in names]
     if whole:
         items.append((WHOLE, None, whole_title))
@@ -119,6 +123,10 @@ def export_run(
     _clear_up(folder, None if everything else {f"{title}.{suffix}" for *_, title in items for suffix in suffixes})
     steps = Steps(job.steps(), len(items), progress or (lambda done, total: None))
     exported = [job.export(name, class_id, folder / title, steps) for name, class_id, title in items]
+    if job.shift is not None:
+        say(_far(folder, job.shift, [file for one in exported for file in one.files if file.path is not None]))
+    elif origin is not None and placement == "world" and not pose.centre:
+        say(said_of_far(origin, False, False))
     if everything:
         empty = empty_objects(scene, run)
         world = "run" if transform is None else "input"
@@ -135,6 +143,14 @@ def export_run(
         if empty:
             say(said_of_empty(empty, "exported"))
     return exported
+
+
+def _far(folder: Path, origin: Tensor, files: Sequence[ExportedFile]) -> str:
+    """Say where files lie that were made about an origin, beside them and in a sentence."""
+    others = [file.path.name for file in files if file.path is not None and "origin" in file.facts]
+    if others:
+        write_origin(folder, origin, others)
+    return said_of_far(origin, len(others) < len(files), bool(others))
 
 
 def _clear_up(folder: Path, names: Set[str] | None) -> None:
@@ -189,8 +205,12 @@ def export_shown(
         raise UserError("nothing is shown, so there is nothing to export: show an object, or lower the least opacity.")
     transform = read_transform(config_path.parent)
     frame = Frame.of_run() if transform is None else Frame(*transform)
+    origin = None if transform is None else local_origin(*transform)
+    if origin is not None:
+        frame = frame.centred(origin)
     if (length := pose.length()) is not None:
-        frame = frame.scaled(metres_per_unit(length, config_path, frame))
+        given = frame if origin is None else frame.centred(-origin)  # points are told in the world's coordinates
+        frame = frame.scaled(metres_per_unit(length, config_path, given))
     views = None
     if exporter.needs_views:
         views = frame.views(training_viewpoints(open_run(config_path), settings, config_path))
@@ -201,6 +221,8 @@ def export_shown(
         in_metres=bool(scale_by),
     )  # fmt: skip
     exporter.write(path, item)
+    if origin is not None and (scale_by or not to_world(path, origin)):
+        write_origin(path.parent, origin, [path.name])
     return path
 
 

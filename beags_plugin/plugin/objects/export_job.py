@@ -16,6 +16,7 @@ from beags_plugin.export.frames import Frame, bounding_box
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.pose_options import PoseOptions
 from beags_plugin.export.standing import turn_to_z
+from beags_plugin.extraction.far_worlds import to_world
 from beags_plugin.extraction.select import select_class
 from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.plugin.objects.clean import Cleaner
@@ -77,7 +78,9 @@ class Shown:
 class ExportJob:
     """The common settings of all items of an export.
 
-    world: the input's frame. metres: of a unit of it, None if files keep its unit. centred: the origin is the middle of
+    world: the input's frame. local: the same about an origin near the scene, in which files are made where the world is
+    far from 0. shift: [3] float64, that origin, if what can hold double precision shall be in the world's coordinates.
+    metres: of a unit of it, None if files keep its unit. centred: the origin is the middle of
     each item. views: in the run's frame. tolerant: leave out a format for which an item has nothing. cleaner: decides
     what belongs to an object; None: all. closing: how the surfaces of objects are made that tell what no photo shows
     and shall be closed; None: nothing is closed.
@@ -94,6 +97,8 @@ class ExportJob:
     cleaner: Cleaner | None
     shown: Shown
     closing: MeshOptions | None
+    local: Frame | None = None
+    shift: torch.Tensor | None = None
 
     def steps(self) -> list[int]:
         """Return the steps of each piece of an item: see ``Steps``."""
@@ -117,7 +122,7 @@ class ExportJob:
         except NothingToExport as error:
             if not self.tolerant:
                 raise
-            frame, doubt = self.world, error
+            frame, doubt = self.local or self.world, error
         views = None if self.views is None else frame.views(self.views)
         photos, no_photos = self._photos(class_id, frame)
         item = ExportItem(
@@ -153,7 +158,8 @@ class ExportJob:
 
         part: its Gaussians, in the run's frame.
         """
-        frame, floor = self.world if self.metres is None else self.world.scaled(self.metres), None
+        world = self.local or self.world
+        frame, floor = world if self.metres is None else world.scaled(self.metres), None
         if (direction := self.pose.direction()) is not None:
             frame = frame.turned(turn_to_z(torch.tensor(direction, dtype=torch.float64)))
         elif self.pose.up and class_id not in (None, BACKGROUND):
@@ -181,7 +187,11 @@ class ExportJob:
 
     def _write(self, label: str, exporter: Exporter, path: Path, item: ExportItem) -> ExportedFile:
         try:
-            return ExportedFile(label, path, exporter.write(path, item))
+            facts = exporter.write(path, item)
+            if self.shift is not None:
+                in_world = to_world(path, self.shift)
+                facts = {**facts, **({"coordinates": "world"} if in_world else {"origin": self.shift.tolist()})}
+            return ExportedFile(label, path, facts)
         except NothingToExport as error:
             if not self.tolerant:
                 raise

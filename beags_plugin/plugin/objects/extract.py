@@ -16,6 +16,7 @@ from torch import Tensor
 
 from beags_plugin.cleaning.clean import LeftOut
 from beags_plugin.core.membership import Membership
+from beags_plugin.extraction.far_worlds import about, local_origin, said_of_far, to_world
 from beags_plugin.extraction.ply import write_ply
 from beags_plugin.extraction.select import remove_class, select_class
 from beags_plugin.plugin.objects.clean import cleaner_of
@@ -66,6 +67,9 @@ def extract_objects(
     ids = objects_with_gaussians(scene, objects, run)
     names = list(objects) or [name for name, index in ids.items() if index != 0]
     transform = read_transform(run)
+    amid = None if transform is None else local_origin(*transform)
+    if transform is not None and amid is not None:
+        transform = about(transform[0], amid), transform[1]
     select = remove_class if remove else select_class
     folders, target = folder_names(scene.classes), output or run / "extracted"
     with writing(target):
@@ -88,9 +92,13 @@ def extract_objects(
         write_text_atomically(json.dumps(origin, indent=2), folder / EXTRACTION_FILE)
         ply = folder / f"{title}.ply"
         write_ply(ply, surfels, part.class_ids, transform)
+        if amid is not None:
+            to_world(ply, amid)
         written.append(Extracted(title, config, ply, len(surfels), left_out))
         if progress is not None:
             progress(len(written), len(names))
+    if amid is not None:
+        say(said_of_far(amid, True, False))
     if not objects and (empty := {name: index for name, index in empty_objects(scene, run).items() if index != 0}):
         say(said_of_empty(empty, "extracted"))
     return written

@@ -19,7 +19,6 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.data.files import image_size, list_photos, photo_names
 from beags_plugin.data.layout import fitting_layouts
 from beags_plugin.data.orientation import as_stored
-from beags_plugin.extraction.frames import to_input_frame
 from beags_plugin.labels.classes import NO_TRUTH, check_names, write_mask
 from beags_plugin.masks.snapping import snap_to_edges
 from beags_plugin.masks.sources import MASK_SOURCES
@@ -66,8 +65,9 @@ class RunGeometry:
 
     def input_means(self) -> Tensor:
         """Return the centres of the Gaussians, [N, 3] float64, in the frame of the input poses."""
-        transform, scale = read_transform(self.folder) or (torch.eye(3, 4), 1.0)
-        return to_input_frame(self.surfels(), transform, scale).means.double()
+        transform, scale = read_transform(self.folder) or (torch.eye(3, 4, dtype=torch.float64), 1.0)
+        means = self.surfels().means.detach().double().cpu()
+        return (means / scale - transform[:, 3]) @ transform[:, :3]  # in double: the world may lie far from 0
 
     def depth(self, view: int) -> Tensor:
         """Return [h, w] float32."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,6 +16,7 @@ from torch import Tensor
 from beags_plugin.core.cameras import camera_extent
 from beags_plugin.core.flattening import flatten, without_empty_bands
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.extraction.far_worlds import double_means, origin_of
 from beags_plugin.extraction.frames import from_input_frame, to_input_frame
 from beags_plugin.importers.base import ImportedScene, find_importer
 from beags_plugin.losses.photometric import psnr
@@ -50,12 +51,14 @@ def start_from_scene(model: SceneModel, datamanager: BeagsDataManager, run: Path
         raise UserError(f"{path} holds no Gaussian that can be used: name another scene.")
     surfels, lost = flatten(scene.gaussians[usable])
     surfels = without_empty_bands(surfels)
+    placed = _placed(path, scene)
+    means = None if placed is None else placed[usable]
     outputs = datamanager.train_dataparser_outputs
     ours = (outputs.dataparser_transform, float(outputs.dataparser_scale))
     views = datamanager.views("train")
     frames: Sequence[StartFrame] = ("auto", "world", "normalised")
     frames = frames if config.start_frame == "auto" else (config.start_frame,)
-    candidates: dict[StartFrame, Surfels] = {name: _moved(surfels, scene, name, ours) for name in frames}
+    candidates: dict[StartFrame, Surfels] = {name: _moved(surfels, scene, name, ours, means) for name in frames}
     frame = frames[0]
     fit = _measure(model, candidates[frame], views)
     model.replace_surfels(candidates[frame])
@@ -83,12 +86,28 @@ def _frame_name(frame: StartFrame, scene: ImportedScene) -> str:
     return "world" if scene.normalization is None else "normalised as its own run"
 
 
-def _moved(surfels: Surfels, scene: ImportedScene, frame: StartFrame, ours: Normalization) -> Surfels:
-    """Return the Gaussians in the frame of this run, x' = scale (R x + t) of the input's x."""
+def _placed(path: Path, scene: ImportedScene) -> Tensor | None:
+    """Return the positions [N, 3] float64 of a scene in a world far from 0; None if the scene's own do."""
+    means = scene.gaussians.means
+    if (exact := double_means(path, len(means))) is not None:
+        return exact
+    origin = origin_of(path) if path.is_file() else None
+    return None if origin is None else means.double() + origin
+
+
+def _moved(
+    surfels: Surfels, scene: ImportedScene, frame: StartFrame, ours: Normalization, means: Tensor | None = None
+) -> Surfels:
+    """Return the Gaussians in the frame of this run, x' = scale (R x + t) of the input's x.
+
+    means: [N, 3] float64, where single precision does not do for those of the surfels; in the input's world.
+    """
     theirs = scene.normalization
     if frame == "normalised" or (frame == "auto" and (scene.note or _same(theirs, ours))):
         return surfels
     moved = Surfels(**{field.name: getattr(surfels, field.name).double() for field in fields(surfels)})
+    if means is not None:
+        moved = replace(moved, means=means)
     if frame == "auto" and theirs is not None:
         moved = to_input_frame(moved, *theirs)
     moved = from_input_frame(moved, *ours)
