@@ -22,6 +22,7 @@ from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.pose_options import PoseOptions
 from beags_plugin.pictures.options import RenderOptions
 from beags_plugin.system.errors import UserError, refused, silence_libraries
+from beags_plugin.system.pasted import quoted
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
@@ -151,7 +152,7 @@ class Extract:
         for done in extracted:
             CONSOLE.print(
                 f"{done.name}: {counted_gaussians(done.gaussians, done.left_out)}\n  {done.ply}\n"
-                f"  ns-viewer --load-config {done.config}",
+                f"  ns-viewer --load-config {quoted(done.config)}",
                 markup=False,
             )
         for sentence in sentences:

@@ -19,6 +19,7 @@ from beags_plugin.system.child_processes import bound
 from beags_plugin.system.digests import code_digest, value_digest
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.lock import run_lock
+from beags_plugin.system.pasted import command, quoted
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
@@ -138,23 +139,25 @@ def _interrupted(output: Path, request: dict[str, Any]) -> bool:
 
 def train(scene: MadeScene, run: Path, preset: str, downscale: float, photos: str) -> None:
     """Run ns-train in a process of its own, as a user would."""
-    command = [
+    words = [
         str(Path(sys.executable).parent / "ns-train"), preset, "--data", str(scene.data),
         "--run-dir", str(run.absolute()), "--vis", "tensorboard", "--pipeline.datamanager.photos", photos,
         "beags-data", "--downscale-factor", str(downscale), *scene.options(),
     ]  # fmt: skip
-    CONSOLE.print("$ " + " ".join(command))
-    _finish(command)
+    CONSOLE.print(f"$ {command(words)}")
+    _finish(words)
 
 
 def resume(run: Path) -> None:
     """Resume an interrupted training in a process of its own."""
-    CONSOLE.print(f"Resuming the training that was interrupted (add --fresh to start anew).\n$ beags resume {run}")
+    CONSOLE.print(
+        f"Resuming the training that was interrupted (add --fresh to start anew).\n$ beags resume {quoted(run)}"
+    )
     _finish([sys.executable, "-m", "beags_plugin.commands.cli", "resume", str(run)])
 
 
-def _finish(command: list[str]) -> None:
-    code = subprocess.run(bound(command)).returncode
+def _finish(words: list[str]) -> None:
+    code = subprocess.run(bound(words)).returncode
     if code != 0:
         raise UserError(f"training ended with exit code {code}; what it printed above says why.")
 
@@ -192,7 +195,7 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
     CONSOLE.print(f"objects: {', '.join(str(item.ply) for item in extracted)}")
     CONSOLE.print(f"figures: {output / 'summary.json'}")
     CONSOLE.print(f"picture: {picture}")
-    CONSOLE.print(f"look:    ns-viewer --load-config {run / 'config.yml'}")
+    CONSOLE.print(f"look:    ns-viewer --load-config {quoted(run / 'config.yml')}")
 
 
 @contextmanager

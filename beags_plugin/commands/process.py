@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from beags_plugin.commands.starting import starting
+from beags_plugin.system.pasted import command
 from beags_plugin.system.progress import progress_bar
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
@@ -36,16 +37,16 @@ class Process:
     def run(self) -> None:
         for line in find_poses(self.data, self.output_dir, starting(self), self.masks, self.ignore_ids):
             CONSOLE.print(line)
-        command = f"ns-train beags-base --data {self.output_dir}"
+        words = ["ns-train", "beags-base", "--data", str(self.output_dir)]
         if self.masks is not None:
-            command = f"ns-train beags-fast --data {self.output_dir} --pipeline.datamanager.photos objects"
+            words = ["ns-train", "beags-fast", *words[2:], "--pipeline.datamanager.photos", "objects"]
             options = []
             if self.masks.resolve() != (self.output_dir / "masks").resolve():
                 options += ["--masks-path", str(self.masks.absolute())]
             if self.ignore_ids:
                 options += ["--ignore-ids", *map(str, self.ignore_ids)]
-            command = " ".join([command, *(["beags-data", *options] if options else [])])
-        CONSOLE.print(f"  {command}")
+            words += ["beags-data", *options] if options else []
+        CONSOLE.print(f"  {command(words)}")
 
 
 def find_poses(

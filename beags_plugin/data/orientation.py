@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.pasted import quoted
 from beags_plugin.system.reading.images import read_image
 
 TAG = 274  # EXIF's tag of the orientation
@@ -55,11 +55,11 @@ def upright_mask_error(mask: Path | str, size: tuple[int, int], photo: Path, pho
     """
     if size != photo_size[::-1] or size == photo_size or (turned := orientation(photo)) not in LYING:
         return None
-    folder = shlex.quote(str(Path(mask).parent)) if isinstance(mask, Path) else "FOLDER"
+    folder = Path(mask).parent if isinstance(mask, Path) else "FOLDER"
     return (
         f"the mask {mask} is upright, {size[0]}x{size[1]} pixels, but its photo {photo} is stored on its side, "
         f"{photo_size[0]}x{photo_size[1]} with EXIF orientation {turned}: turn the masks with beags masks make "
-        f"--upright --overwrite --source id-images --options folder={folder} --data FOLDER."
+        f"--upright --overwrite --source id-images --options folder={quoted(folder)} --data FOLDER."
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.pasted import quoted
 from beags_plugin.system.reading.images import read_image
 from beags_plugin.system.reading.text import load_json, reason
 
@@ -40,7 +40,7 @@ def read_id_mask(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarray
             "with one channel, as 8-bit grey PNG."
         )
     if mode not in _ID_MODES or values.ndim != 2:
-        folder = shlex.quote(str(Path(path).parent))
+        folder = quoted(Path(path).parent)
         raise UserError(
             f"the mask {path} has colours (mode {mode}) where class ids are needed: save it as 8-bit or 16-bit grey "
             "PNG, or let each colour become an id with beags masks make --source id-images --options "

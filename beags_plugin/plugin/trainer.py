@@ -37,6 +37,7 @@ from beags_plugin.system.errors import UserError, is_of_disk, refused, silence_l
 from beags_plugin.system.interrupts import Interrupts, stop
 from beags_plugin.system.lock import run_lock
 from beags_plugin.system.memory import peak_memory_mb
+from beags_plugin.system.pasted import quoted
 from beags_plugin.system.reading.text import reason
 from beags_plugin.system.whole_files import remove_unfinished, write_text_atomically
 
@@ -121,7 +122,7 @@ class BeagsTrainer(Trainer):
         if isinstance(error, Exception) and is_out_of_memory(error):
             return UserError(
                 f"memory ran out after step {self._done} ({reason(error)}): the last checkpoint is whole. "
-                f"Close other programs and go on with beags resume {self.base_dir}, or begin anew with smaller "
+                f"Close other programs and go on with beags resume {quoted(self.base_dir)}, or begin anew with smaller "
                 "photos or fewer Gaussians."
             )
         if not isinstance(error, OSError):
@@ -219,7 +220,7 @@ class BeagsTrainer(Trainer):
         except KeyboardInterrupt as interrupt:
             if (self.base_dir / REPORT_FILE).exists():  # complete: the signal ended what shows it in the browser
                 return
-            message = f"Stopped. To go on: beags resume {self.base_dir}"
+            message = f"Stopped. To go on: beags resume {quoted(self.base_dir)}"
             CONSOLE.print(message, highlight=False, markup=False, soft_wrap=True)
             raise SystemExit(self._interrupts.exit_code) from interrupt
 

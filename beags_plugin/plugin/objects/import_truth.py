@@ -19,6 +19,7 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import UNTOLD, read_object_mask, write_mask
 from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
 from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.pasted import quoted
 from beags_plugin.system.whole_files import write_text_atomically
 
 PROMPTS = "prompts.json"
@@ -84,7 +85,7 @@ def import_truth(
         write_text_atomically(json.dumps({"objects": entries}, indent=1) + "\n", prompts)
         lines.append(
             f"prompts of the scribbles: {prompts}\n"
-            f"  beags masks make --data {scene.root} --source sam2 --options prompts={prompts}"
+            f"  beags masks make --data {quoted(scene.root)} --source sam2 --options prompts={quoted(prompts)}"
         )
     elif not any(each.scribbles for each in objects):
         lines.append("No scribbles are there, so no prompts are written.")

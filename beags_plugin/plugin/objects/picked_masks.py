@@ -13,6 +13,7 @@ from beags_plugin.plugin.objects.make_masks import make_masks
 from beags_plugin.plugin.runs.place import open_run
 from beags_plugin.system.digests import content_digest
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.pasted import command, quoted
 from beags_plugin.system.whole_files import write_text_atomically
 
 STAMP = "masks_picked.txt"  # beside masks that were picked: a digest of them, which shows whether they were mended
@@ -41,12 +42,12 @@ def save_masks(config_path: Path, members: Membership, names: Mapping[int, str])
     write_text_atomically(_digest(folder), folder / STAMP)
     config = open_run(config_path)
     saved = f"{'Replaced' if again else 'Saved'} {folder / 'masks'} and classes.json; look at {folder / 'made.png'}."
-    refine = f"ns-train beags-refine --data {data.data} --load-dir {config.get_checkpoint_dir()}"
+    refine = command(["ns-train", "beags-refine", "--data", data.data, "--load-dir", config.get_checkpoint_dir()])
     if folder == scene:
         return [saved, f"Next: {refine}"]
     kept = f"{scene} has masks already, which stay as they are."
-    return [saved, kept, f"Next: {refine} beags-data --masks-path {folder / 'masks'} --classes-path "
-            f"{folder / 'classes.json'}"]  # fmt: skip
+    return [saved, kept, f"Next: {refine} beags-data --masks-path {quoted(folder / 'masks')} --classes-path "
+            f"{quoted(folder / 'classes.json')}"]  # fmt: skip
 
 
 def _holds_masks(folder: Path) -> bool:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from beags_plugin.plugin.options.config import CONFIG_FILE
 from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, REPORT_FILE
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.pasted import quoted
 from beags_plugin.system.progress import say
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ def resumed_config(run: Path, data: Path | None = None) -> BeagsTrainerConfig:
     if (folder / EXTRACTION_FILE).exists() or scene_alone(read_checkpoint(newest_checkpoint(models))):
         raise UserError(
             f"{folder} holds a scene without the state of its training: resume the run that it comes from, or refine "
-            f"it: ns-train beags-refine --load-dir {models}."
+            f"it: ns-train beags-refine --load-dir {quoted(models)}."
         )
     config.load_dir, config.load_checkpoint, config.load_step = models, None, None
     return config

@@ -26,6 +26,7 @@ from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.pasted import quoted
 from beags_plugin.system.reading.text import load_json, reason
 
 
@@ -85,7 +86,7 @@ def read_assigned_run(config_path: Path, data: Path | None = None) -> SavedScene
     if not scene.assigned:
         raise UserError(
             f"{config_path.parent} is a base without classes: refine it first "
-            f"(ns-train beags-refine --load-dir {scene.config.get_checkpoint_dir()})."
+            f"(ns-train beags-refine --load-dir {quoted(scene.config.get_checkpoint_dir())})."
         )
     return scene
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from beags_plugin.system.pasted import quoted
+
 _HEAD = 2048  # bytes that tell; a pointer of Git LFS has fewer than 1024
 _LFS = b"version https://git-lfs.github.com/spec/"
 _ANNEX = re.compile(rb"^(?:\.\./|/)*\.?git/annex/objects/|^/annex/objects/")
@@ -35,15 +37,9 @@ def of_bytes(head: bytes, name: str) -> str | None:
     if head.startswith(_LFS):
         return "it is a pointer of Git LFS, not the file itself; run git lfs pull in its folder"
     if _ANNEX.match(head):
-        return f"it is a pointer of git-annex, not the file itself; run git annex get {_quoted(name)} in its folder"
+        return f"it is a pointer of git-annex, not the file itself; run git annex get {quoted(name)} in its folder"
     if _PAGE.match(head.removeprefix(b"\xef\xbb\xbf")):
         return "it is a web page, not the file itself; open the link in a browser and download the file"
     if _XML.match(head):
         return "it is an error message of the server, not the file itself; download it again"
     return None
-
-
-def _quoted(name: str) -> str:
-    import shlex
-
-    return shlex.quote(name)
