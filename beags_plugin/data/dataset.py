@@ -44,6 +44,7 @@ class PoseTable:
     K: [V, 3, 3] float64, pixels of ``sizes``. sizes: [V, 2] integer width and height; the files may be smaller copies.
     bounds: [V, 2] float64, nearest and farthest depth, world units, or None.
     lens: COLMAP's cameras.bin or cameras.txt with one camera, for its lens distortion, or None.
+    missing: where the photos of other poses of the file should lie, which are left out of these.
     """
 
     file: Path
@@ -53,6 +54,7 @@ class PoseTable:
     sizes: npt.NDArray[np.int64]
     bounds: npt.NDArray[np.float64] | None = None
     lens: Path | None = None
+    missing: tuple[Path, ...] = ()
 
 
 Poses = ColmapModel | TransformsFile | PoseTable

@@ -92,6 +92,26 @@ def width_note(folder: Path) -> str:
     return size_note(folder, f"{LARGEST_WIDTH} pixels wide, as in the paper")
 
 
+def numbered(files: Sequence[Path], count: int) -> list[int] | None:
+    """Return which of ``count`` photos these are where some are missing, by the numbers from 0 that end their names.
+
+    None where the names are not all such numbers: then nobody can tell which are missing.
+    """
+    ends = [re.search(r"\d+$", file.stem) for file in files]
+    places = [int(end[0]) for end in ends if end is not None]
+    told = len(set(places)) == len(files) < count and all(place < count for place in places)
+    return places if told else None
+
+
+def missing_numbers(files: Sequence[Path], places: Sequence[int], count: int) -> tuple[Path, ...]:
+    """Return the photos of ``count`` that are missing beside ``files``, whose ``places`` are those of ``numbered``."""
+    first = files[0]
+    digits = len(re.search(r"\d+$", first.stem)[0])  # type: ignore[index]
+    start = first.stem[:-digits]
+    absent = sorted(set(range(count)) - set(places))
+    return tuple(first.with_name(f"{start}{index:0{digits}d}{first.suffix}") for index in absent)
+
+
 def image_width(folder: Path) -> int:
     """Return the width in pixels of the first of the images in a folder."""
     return image_size(list_images(folder)[0])[0]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from beags_plugin.data.dataset import PoseTable
-from beags_plugin.data.files import list_images
+from beags_plugin.data.files import list_images, missing_numbers, numbered
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.arrays import load_array
 from beags_plugin.system.reading.text import reason
@@ -32,6 +32,10 @@ def read_poses_bounds(file: Path, images: Path) -> PoseTable:
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f" or not np.isfinite(rows).all():
         raise UserError(f"the poses {file} are no finite [views, 17] numbers: save them as LLFF does.")
     files = list_images(images)
+    missing: tuple[Path, ...] = ()
+    if (places := numbered(files, len(rows))) is not None:
+        missing = missing_numbers(files, places, len(rows))
+        rows = rows[places]
     if len(files) != len(rows):
         raise UserError(
             f"{file} has {len(rows)} poses but {images} {len(files)} images: keep the images that the poses are of."
@@ -46,7 +50,7 @@ def read_poses_bounds(file: Path, images: Path) -> PoseTable:
     sizes = np.stack([width, height], axis=1).astype(np.int64)
     lenses = (file.parent / "sparse" / "0" / f"cameras.{end}" for end in ("txt", "bin"))
     lens = next((each for each in lenses if each.is_file()), None)
-    return PoseTable(file, tuple(files), poses, K, sizes, rows[:, 15:].astype(np.float64), lens=lens)
+    return PoseTable(file, tuple(files), poses, K, sizes, rows[:, 15:].astype(np.float64), lens, missing)
 
 
 def _check_rows(file: Path, images: list[Path], rows: np.ndarray) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from beags_plugin.data.dataset import Dataset, PoseTable
-from beags_plugin.data.files import choose_images, image_size, list_images
+from beags_plugin.data.files import choose_images, image_size, list_images, missing_numbers, numbered
 from beags_plugin.data.layout import Layout
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.arrays import load_arrays
@@ -39,17 +39,20 @@ class Dtu(Layout):
     def read(self, root: Path, images: Path | None) -> Dataset:
         original = next(list_images(root / name) for name in IMAGES if list_images(root / name))
         files = list_images(choose_images(root, images)) if images is not None else original
-        poses = read_cameras(root / FILE, original)
+        to_world, K, sizes, missing = read_cameras(root / FILE, original)
         if len(files) != len(original):
             raise UserError(f"{images} holds {len(files)} images, not {len(original)}: keep a copy of every one.")
         masks = list_images(root / "mask")
+        if missing and len(masks) == len(files) + len(missing):  # those of all photos
+            there = numbered(original, len(masks)) or []
+            masks = [masks[index] for index in there]
         if masks and len(masks) != len(files):
             raise UserError(f"{root / 'mask'} holds {len(masks)} masks for {len(files)} images: keep one for each.")
         by_stem = {file.stem: mask for file, mask in zip(files, masks, strict=False)}
         return Dataset(
             self.title,
             root,
-            PoseTable(root / FILE, tuple(files), *poses),
+            PoseTable(root / FILE, tuple(files), to_world, K, sizes, missing=missing),
             mask_kind="binary" if masks else "ids",
             mask_files=by_stem if masks else None,
             class_names={1: "object"} if masks else None,
@@ -59,9 +62,10 @@ class Dtu(Layout):
 
 def read_cameras(
     file: Path, images: list[Path]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.int64], tuple[Path, ...]]:
     """Read camera to world [V, 3, 4] (OpenGL axes), K [V, 3, 3] and sizes [V, 2] of the original images.
 
+    The last part names the photos of other cameras, which are missing, as far as the images' numbers tell them.
     ``world_mat_i`` [4, 4] projects the world to pixels, ``scale_mat_i`` takes the unit sphere to the world.
     Raises ``UserError`` if an entry is missing or describes no camera.
     """
@@ -70,10 +74,13 @@ def read_cameras(
     except (OSError, ValueError, TypeError) as error:
         raise UserError(f"the cameras {file} cannot be read ({reason(error)}): restore the file.") from error
     count = sum(name.startswith("world_mat_") and not name.startswith("world_mat_inv_") for name in table)
-    if count != len(images):
+    places, missing = numbered(images, count), ()
+    if places is not None:
+        missing = missing_numbers(images, places, count)
+    if len(images) + len(missing) != count:
         raise UserError(f"{file} has {count} cameras but there are {len(images)} images: keep the images it is of.")
     poses, intrinsics = [], []
-    for index in range(count):
+    for index in range(count) if places is None else places:
         projection = table.get(f"world_mat_{index}")
         if projection is None or projection.shape != (4, 4):
             raise UserError(f"{file} lacks the 4 x 4 matrix world_mat_{index}: restore the file.")
@@ -101,7 +108,7 @@ def read_cameras(
                 f"its {size[0]}x{size[1]} pixels: keep the images that the file is of in {image.parent}, and name the "
                 "folder of smaller copies with --images-path."
             )
-    return np.stack(poses), np.stack(intrinsics), sizes
+    return np.stack(poses), np.stack(intrinsics), sizes, missing
 
 
 def _is_regular(matrix: npt.NDArray[np.float64]) -> bool:

@@ -36,7 +36,7 @@ class SourceViews:
     file: of the poses, for messages. names: with slashes. wanted: where the photos should lie. images: where they do,
     None for missing ones. camera_to_world: [V, 3, 4] float64, OpenGL axes. cameras: None for missing photos.
     members: split name to indices, or None. orientation, applied, applied_scale: of ``placing.place``. points: a .ply
-    in the poses' world, or None.
+    in the poses' world, or None. missing: photos of further poses, which the layout has left out.
     """
 
     file: Path
@@ -50,6 +50,7 @@ class SourceViews:
     applied: np.ndarray | None = None
     applied_scale: float = 1.0
     points: Path | None = None
+    missing: tuple[Path, ...] = ()
 
 
 def read_source(poses: ColmapModel | TransformsFile | PoseTable, root: Path) -> SourceViews:
@@ -143,8 +144,9 @@ def _of_table(table: PoseTable) -> SourceViews:
     ]
     names = [path.as_posix() for path in table.images]
     return SourceViews(
-        table.file, names, list(table.images), list(table.images), table.camera_to_world.astype(np.float64), cameras
-    )
+        table.file, names, list(table.images), list(table.images), table.camera_to_world.astype(np.float64), cameras,
+        missing=table.missing,
+    )  # fmt: skip
 
 
 def _listed(file: Path) -> list[str]:

@@ -54,7 +54,8 @@ def read_poses(poses: Poses, root: Path, normalization: Normalization, strict: b
     if len(source.names) < 2 and source.members is None:
         raise UserError(f"{file} holds the pose of one image alone: give poses for at least two.")
     missing = [path for path, image in zip(source.wanted, source.images, strict=True) if image is None]
-    notes = [missing_note(missing, len(source.names), file, strict)]
+    missing += source.missing
+    notes = [missing_note(missing, len(source.names) + len(source.missing), file, strict)]
     # The missing ones count here too, so that a run keeps its world when a photo goes.
     placed, placing = place(
         source.camera_to_world, normalization, file, source.orientation, source.applied, source.applied_scale
