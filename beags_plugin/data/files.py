@@ -198,6 +198,24 @@ def unposed_note(posed: Sequence[Path]) -> str | None:
     return f"{len(without)} photos have no pose, so they are not used; the first of them is {without[0]}."
 
 
+def check_mask_files(folder: Path, images: Sequence[Path]) -> None:
+    """Raise ``UserError`` for a folder in which there are masks, but none that belongs to an image."""
+    files = [path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES]
+    stems = {image.stem for image in images}
+    if other := next((path for path in sorted(files) if path.suffix != ".png" and path.stem in stems), None):
+        why, make = "masks are .png files", "save"
+        if other.suffix.lower() in (".jpg", ".jpeg"):
+            why, make = "JPEG blurs class ids", "make them anew and save"
+        raise UserError(
+            f"the masks in {folder} are {other.suffix} files, as {other.name}, but {why}: {make} them as PNG."
+        )
+    if any(path.suffix == ".png" for path in files):
+        raise UserError(
+            f"no mask in {folder} has the name of an image ({images[0].stem}.png, ...): rename the masks, or give "
+            "another masks_path."
+        )
+
+
 def same_proportions(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Return whether two images (width, height) may be copies of one: a smaller copy rounds each side by a pixel."""
     (width, height), (other_width, other_height) = size, other

@@ -150,3 +150,14 @@ def test_colour_images_that_were_smoothed_are_no_ids(tmp_path):
     assert set(np.unique(source._ids(tmp_path / "1.png", {}))) == {0, 1, 2}
     with pytest.raises(UserError, match="0.png has .* colours that fill no area"):
         source._ids(tmp_path / "0.png", {})
+
+
+@pytest.mark.parametrize(
+    ("suffix", "words"), [(".jpg", "JPEG blurs class ids: make them anew"), (".bmp", "are .png fil")]
+)
+def test_masks_of_another_file_type_are_not_overlooked(tmp_path, suffix, words):
+    write_transforms(tmp_path)
+    for index in range(9):
+        write_image(tmp_path / f"masks/v{index:02d}{suffix}", np.zeros((12, 20), np.uint8))
+    with pytest.raises(UserError, match=f"the masks in .* are {suffix} files, as v00{suffix}, but .*{words}"):
+        parse(tmp_path)

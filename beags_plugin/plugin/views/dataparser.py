@@ -17,7 +17,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from tyro.conf import Suppress
 
 from beags_plugin.data.dataset import Dataset, MaskKind
-from beags_plugin.data.files import check_same_size, files_of_views, image_size
+from beags_plugin.data.files import check_mask_files, check_same_size, files_of_views, image_size
 from beags_plugin.data.ground_truth import find_ground_truth, of_views, stray_note
 from beags_plugin.data.labels import read_class_names
 from beags_plugin.data.layout import read_dataset
@@ -189,11 +189,8 @@ class BeagsDataParser(DataParser):
         sizes = [image_size(path) for path in views.images]
         self.fit_cameras(views, sizes)
         masks, folder, kind = self.mask_files(scene, views)
-        if not any(masks) and any(folder.glob("**/*.png")):
-            raise UserError(
-                f"no mask in {folder} has the name of an image ({views.images[0].stem}.png, ...): "
-                f"rename the masks, or give another masks_path."
-            )
+        if not any(masks):
+            check_mask_files(folder, views.images)
         check_same_size(masks, sizes, views.images)
         present = [mask for mask in masks if mask is not None and kind == "ids"]
         truth = (scene.root / config.ground_truth_path, views.images, images_root(scene))
