@@ -88,6 +88,18 @@ def test_sources_name_the_orientation_and_the_option(tmp_path):
     assert labels.shape == (HEIGHT, WIDTH) and upright(labels, 6)[4, 3] == 1 and labels.sum() > 20
 
 
+def test_polygons_of_another_size_are_refused(tmp_path, capsys):
+    write_transforms(tmp_path / "scene")
+    image = {"id": 1, "file_name": "v01.png", "width": 2 * WIDTH, "height": 2 * HEIGHT}
+    entry = {"id": 1, "image_id": 1, "category_id": 1, "segmentation": [[1, 1, 1, 8, 5, 8, 5, 1]]}
+    content = {"images": [image], "categories": [{"id": 1, "name": "cup"}], "annotations": [entry]}
+    (tmp_path / "coco.json").write_text(json.dumps(content))
+    options = ["--source", "coco", "--options", f"file={tmp_path / 'coco.json'}"]
+    with pytest.raises(SystemExit):
+        cli.main(["masks", "make", "--data", str(tmp_path / "scene"), *options])
+    assert "annotated at 40x24 pixels but is 20x12" in " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.parametrize("turned", [2, 3, 4])
 def test_the_check_notes_photos_that_are_turned_within_their_size(tmp_path, turned, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)

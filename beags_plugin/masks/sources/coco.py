@@ -64,10 +64,7 @@ class CocoSource(MaskSource):
             if photo.name not in annotated:
                 return None
             shape = (photo.height, photo.width)
-            if sentence := upright_mask_error(
-                f"of {photo.name} in {path}", sizes[annotated[photo.name]], photo.path, (photo.width, photo.height)
-            ):
-                raise UserError(sentence)
+            _check_size(path, photo, sizes[annotated[photo.name]])
             whole: dict[int, np.ndarray] = {}  # an object may have several annotations
             for class_id, segmentation in of_view[annotated[photo.name]]:
                 mask = decoded(segmentation, shape, f"{path}, image {photo.name}")
@@ -95,6 +92,19 @@ def _number_or_word(value: Any) -> int | str:
     if not isinstance(value, (int, str)):
         raise ValueError(f"the id {value!r} is neither a whole number nor a word")
     return value
+
+
+def _check_size(path: Path, photo: Photo, size: tuple[Any, Any]) -> None:
+    """Raise ``UserError`` where the JSON tells another (width, height) of an image than its photo has."""
+    if not all(type(side) is int for side in size) or size == (photo.width, photo.height):
+        return
+    whose = f"of {photo.name} in {path}"
+    if sentence := upright_mask_error(whose, size, photo.path, (photo.width, photo.height)):
+        raise UserError(sentence)
+    raise UserError(
+        f"{path}, image {photo.name}: it is annotated at {size[0]}x{size[1]} pixels but is "
+        f"{photo.width}x{photo.height}: annotate the image at its full size."
+    )
 
 
 def packed_total(counts: str) -> int:
