@@ -37,8 +37,8 @@ class Placing:
     """x' = scale (R x + t) from the world of the poses' file to the cameras'.
 
     transform: [3, 4] float64, R | t. original: the same from the world before the file's own ``applied_transform``;
-    original_scale: with its ``applied_scale``. origin: [3] float64, a point of the file's world amid the cameras, if
-    that lies so far from 0 that single precision does not do; else None.
+    original_scale: with its ``applied_scale``. origin: [3] float64, a point of the original world amid the cameras,
+    if that lies so far from 0 that single precision does not do; else None.
     """
 
     transform: Tensor
@@ -126,7 +126,12 @@ def place(
         original = matrix @ torch.cat([applied_matrix, below])
         if not (far or shifted):
             original = original.float().double()  # as nerfstudio saves it
-    return poses, Placing(matrix, scale, original, scale * applied_scale, origin if far else None)
+    amid = None
+    if far:
+        amid = origin
+        if applied_matrix is not None:
+            amid = torch.linalg.lstsq(applied_matrix[:, :3], (origin - applied_matrix[:, 3])[:, None]).solution[:, 0]
+    return poses, Placing(matrix, scale, original, scale * applied_scale, amid)
 
 
 def _rigid(matrix: Tensor) -> Tensor:

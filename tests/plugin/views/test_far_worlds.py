@@ -93,7 +93,11 @@ def test_points_stay_where_the_photos_show_them(tmp_path, source, options, capsy
     back = (moved.double() / scale - transform[:, 3]) @ transform[:, :3]
     np.testing.assert_allclose(back.numpy(), POINTS + MAP, atol=1e-5, rtol=0)
     said = capsys.readouterr().out
-    assert "as map coordinates are" in said and "exports go back in double" in said
+    assert (
+        "The cameras are about 453211, 5411874, 51" in said
+        and "as map coordinates are" in said
+        and "exports go back in double" in said
+    )
 
 
 def test_the_saved_transform_and_cameras_go_back_in_double(tmp_path):
