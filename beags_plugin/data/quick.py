@@ -9,8 +9,8 @@ from beags_plugin.data.dataset import ColmapModel, PoseTable
 from beags_plugin.data.files import image_size
 from beags_plugin.data.layout import read_dataset
 from beags_plugin.data.photo_files import PhotoFinder
-from beags_plugin.data.transforms_file import read_transforms
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.text import load_json
 
 QUICK_PIXELS = 50_000  # per view, at most
 
@@ -42,8 +42,8 @@ def _images(data: Path) -> list[Path]:
 def _first_frame(data: Path) -> list[Path]:
     """Return the first image of transforms.json that is there; none without, or if that file is damaged."""
     try:
-        frames = read_transforms(data / "transforms.json")["frames"]
-        found = PhotoFinder([data, data / "images"]).find([frame["file_path"] for frame in frames])
-    except UserError:  # the data parser names what is wrong
+        names = [str(frame["file_path"]) for frame in load_json(data / "transforms.json")["frames"]]
+        found = PhotoFinder([data, data / "images"]).find(names)
+    except (OSError, ValueError, LookupError, TypeError, UserError):  # the data parser names what is wrong
         return []
     return [path for path in found if path is not None][:1]
