@@ -3,4 +3,4 @@
 Importing this package imports nothing heavy: every ns-* command pays for it at start-up.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

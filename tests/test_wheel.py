@@ -92,7 +92,7 @@ def test_what_is_in_it(built):
     assert names - {module, openmp} == package - native | {f"beags_plugin/{name}" for name in settings}
     with tarfile.open(sdist) as archive:
         sources = {name.partition("/")[2] for name in archive.getnames()}
-    others = {"pyproject.toml", "CMakeLists.txt", "LICENSE", "README.md", "PKG-INFO"}
+    others = {"pyproject.toml", "CMakeLists.txt", "LICENSE", "README.md", "CHANGELOG.md", "CITATION.cff", "PKG-INFO"}
     assert sources == package | settings | files("cmake") | others
 
     content = (built / module).read_bytes()
