@@ -82,8 +82,6 @@ if [ "$packages_now" != "$packages_before" ]; then
   # sam2 (transformers) is for the tests of its masks; it brings no weights.
   # The build tools are in the environment by now, so the build needs no isolated copy of them.
   pip install -qq --no-build-isolation "${build[@]}" "${pins[@]}" -e '.[dev,sam2]'
-  pip install -qq "${pins[@]}" onnxruntime ||
-    echo "beags setup: pip cannot install onnxruntime here; going on without the tests of salient masks"
   # nerfstudio brings plain opencv, which shares the folder cv2/ with contrib: the one written last wins.
   if ! contrib_works; then
     pip install -qq "${pins[@]}" --force-reinstall --no-deps "$opencv"

@@ -26,6 +26,7 @@ def checks() -> dict[str, Check]:
 
 def test_everything_is_checked(checks):
     expected = {"python", "torch", "CUDA device", "nvcc", "nerfstudio", "opencv contrib", "open3d", "presets"}
+    expected.add("masks of photos")
     assert expected | {f"rasterizer {name}" for name in RASTERIZERS.names()} <= set(checks)
     assert all(check.sentence and "\n" not in check.sentence for check in checks.values())
     assert not any(check.repair for check in checks.values() if check.ok)
@@ -51,6 +52,18 @@ def test_missing_parts_of_packages_are_findings(monkeypatch):
     monkeypatch.setattr(metadata, "entry_points", lambda group: [])
     presets = diagnosis._presets()
     assert not presets.ok and presets.required and presets.repair == "pip install -c constraints.txt -e ."
+
+
+def test_what_masks_of_photos_need_is_named_before_they_are_made(monkeypatch, tmp_path):
+    monkeypatch.setenv("U2NET_HOME", str(tmp_path))
+    monkeypatch.setattr("beags_plugin.masks.sources.salient.find_spec", lambda name: None)
+    without = diagnosis._masks()
+    assert not without.ok and not without.required and without.repair == "pip install onnxruntime"
+    assert without.sentence == "the library onnxruntime is not installed"
+    monkeypatch.setattr("beags_plugin.masks.sources.salient.find_spec", lambda name: object())
+    assert not (fetched := diagnosis._masks()).ok and fetched.repair == "beags masks weights"
+    (tmp_path / "u2netp.onnx").touch()
+    assert diagnosis._masks().ok
 
 
 def test_a_check_that_breaks_in_any_way_is_reported():

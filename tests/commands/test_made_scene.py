@@ -22,7 +22,7 @@ from beags_plugin.masks.sources.salient import SalientSource
 from beags_plugin.posing.photos import find_photos
 from beags_plugin.system.errors import UserError
 
-pytest.importorskip("onnxruntime", reason="the extra [salient] (onnxruntime) is not installed")
+pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
 pytest.importorskip("pycolmap")
 PHOTOS = 12
 

@@ -17,7 +17,7 @@ from beags_plugin.commands.cli import main
 from beags_plugin.masks.sources.base import Photo, SourceScene
 from beags_plugin.masks.sources.salient import SalientSource, load, weights_folder
 
-pytest.importorskip("onnxruntime", reason="the extra [salient] (onnxruntime) is not installed")
+pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
 
 
 @pytest.fixture(autouse=True)

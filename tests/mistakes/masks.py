@@ -235,7 +235,7 @@ def salient(weights: bytes | None, path: str = "../home/u2netp.onnx", model: str
             (data / path).write_bytes(weights)
 
     def make(at: Place):
-        pytest.importorskip("onnxruntime", reason="the extra [salient] (onnxruntime) is not installed")
+        pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
         at.patch.setenv("U2NET_HOME", str(at.root / "home"))
         return made("salient", write, f"--options model={model}")(at)
 

@@ -22,7 +22,7 @@ _REPAIRS = {  # by the name of a check that raises
 
 def diagnose() -> Iterator[Check]:
     """Check everything that beags uses, the quick ones first; never fails, whatever is missing or broken."""
-    for check in (_python, _nvcc, _presets, _opencv, _torch, _cuda, _nerfstudio, _open3d):
+    for check in (_python, _nvcc, _presets, _opencv, _masks, _torch, _cuda, _nerfstudio, _open3d):
         yield _safely(check)
     yield from map(_safely, rasterizers())
     yield _safely(first_contact_check)
@@ -104,6 +104,20 @@ def _opencv() -> Check:
     ok = hasattr(getattr(cv2, "ximgproc", None), "guidedFilter")
     sentence = f"{cv2.__version__} {'with' if ok else 'without'} cv2.ximgproc.guidedFilter"
     return Check("opencv contrib", ok, sentence, repair="" if ok else _OPENCV)
+
+
+def _masks() -> Check:
+    from beags_plugin.masks.sources.salient import SalientSource, weights_folder
+
+    name = "masks of photos"
+    if reason := SalientSource.unavailable():
+        return Check(name, False, reason.partition(":")[0], False, "pip install onnxruntime")
+    weights = weights_folder() / "u2netp.onnx"
+    if not weights.is_file():
+        return Check(
+            name, False, "no weights yet; the first demo from photos fetches 4.6 MB", False, "beags masks weights"
+        )
+    return Check(name, True, f"onnxruntime with {weights}", False)
 
 
 def _open3d() -> Check:

@@ -40,7 +40,7 @@ class SalientSource(MaskSource):
     @classmethod
     def unavailable(cls) -> str | None:
         if find_spec("onnxruntime") is None:
-            return "the library onnxruntime is not installed: pip install beags[salient]."
+            return "the library onnxruntime is not installed: pip install onnxruntime."
         return None
 
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
