@@ -1,4 +1,4 @@
-# make setup | test [JOBS=n] | wheel | demo [DATA=folder] | soak | fuzz [COUNT=n] [SEED=n] | lint | format | clean
+# make setup | test [JOBS=n] | wheel | demo [DATA=folder] | docs | soak | fuzz [COUNT=n] [SEED=n] | lint | format | clean
 # BEAGS_VENV names the environment; clones may share one. PYTHON names the interpreter that makes it.
 BEAGS_VENV ?= .venv
 BIN := $(BEAGS_VENV)/bin
@@ -9,7 +9,7 @@ export OMP_WAIT_POLICY = PASSIVE
 
 JOBS ?= 2
 
-.PHONY: help setup test wheel demo soak fuzz lint format clean
+.PHONY: help setup test wheel demo docs soak fuzz lint format clean
 
 help:
 	@sed -n '1,2p' Makefile
@@ -30,6 +30,14 @@ wheel: setup
 
 demo: setup
 	"$(BIN)/beags" demo $(if $(DATA),--data "$(DATA)")
+
+# The documentation site, in build/docs/site; a warning ends it. Its tools (the extra "docs") are installed when they are
+# first needed.
+docs: setup
+	@"$(BIN)/python" -c 'import mkdocstrings, zensical' 2>/dev/null || \
+	  "$(BIN)/python" -m pip --disable-pip-version-check install -qq -c constraints.txt zensical mkdocstrings-python
+	"$(BIN)/python" scripts/docs_site.py
+	NO_COLOR=1 "$(BIN)/zensical" build --strict --clean
 
 # Long tests: random scenes and files, runs that are killed, memory over thousands of steps. About an hour.
 soak: fuzz
@@ -53,6 +61,6 @@ format: setup
 
 # Leaves the environment (it may be shared), but makes the next setup build again.
 clean:
-	rm -rf build dist .pytest_cache .ruff_cache .hypothesis
+	rm -rf build dist .cache .pytest_cache .ruff_cache .hypothesis
 	find . -path ./.venv -prune -o -name __pycache__ -type d -exec rm -rf {} +
 	rm -f "$(BEAGS_VENV)/.beags-source"

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
 # Rewrite constraints.txt from an environment: scripts/freeze_constraints.sh [environment folder]
+# Run `make docs` there before, which installs the tools of the site.
 # Only "name==version" lines are kept: no paths, no links, no local version suffix (torch's +cpu, +cu12 resolve nowhere
 # else).
 set -euo pipefail
