@@ -1,6 +1,6 @@
 """Size and loss of splat files: python -m benchmarks.splat_files RUN/config.yml [RUN/config.yml ...].
 
-Each object, and the whole scene, is written in every splat format, read again (``splat_readers``) and drawn alone, on
+Each object, and the whole scene, is written in every splat format, read again (``importers``) and drawn alone, on
 white, from the held-out views. Printed per format: bytes, and PSNR against what the .ply draws, over the pixels that
 either draws on (alpha above 1/255), all views together. "html" is the page without the 2.6 MB of its viewer: colours
 that do not change with the view, and below it what the degree-0 coefficients alone would give.
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,25 +17,25 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.flattening import flatten
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import ExportItem, Viewpoints, make_exporter
 from beags_plugin.export.page_colors import seen_colors
 from beags_plugin.export.web_page import recording
-from beags_plugin.extraction.ply import read_ply
 from beags_plugin.extraction.select import select_class
+from beags_plugin.importers.base import read_scene
 from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.plugin.objects.evaluate import EvaluatedRun
 from beags_plugin.plugin.runs.read import raster_settings, read_assigned_run, training_viewpoints
 from beags_plugin.rasterizers.interface import MIN_ALPHA
 from beags_plugin.rasterizers.rendering import surfel_inputs
-from benchmarks.splat_readers import in_ply_axes, read_compressed_ply, read_sog, read_spz, surfels_of
 
-READERS: Mapping[str, Callable[[Path], Surfels]] = {
-    "ply": lambda path: read_ply(path)[0],
-    "compressed-ply": lambda path: surfels_of(read_compressed_ply(path)),
-    "spz": lambda path: surfels_of(in_ply_axes(read_spz(path))),
-    "sog": lambda path: surfels_of(read_sog(path)),
-}
+SUFFIXES = {"ply": "ply", "compressed-ply": "compressed.ply", "spz": "spz", "sog": "sog"}
+
+
+def read(path: Path) -> Surfels:
+    """Return the Gaussians of a file that was written here, as discs."""
+    return flatten(read_scene(path).gaussians)[0]
 
 
 def drawn(surfels: Surfels, camera: Camera, views: Viewpoints) -> tuple[Tensor, Tensor]:
@@ -67,14 +66,14 @@ def measure(config_path: Path) -> None:
     present = [class_id for class_id in scene.members.present() if class_id != BACKGROUND]
     parts = {run.classes[each]: select_class(surfels, scene.members, each)[0] for each in present}
     print(f"{run.name}, {len(cameras)} held-out views, degree {surfels.sh_degree}\n")
-    print("| | Gaussians | " + " | ".join(f"{name}, PSNR" for name in READERS) + " | html, PSNR | degree 0 |")
-    print("|---|" + "---|" * (len(READERS) + 3))
+    print("| | Gaussians | " + " | ".join(f"{name}, PSNR" for name in SUFFIXES) + " | html, PSNR | degree 0 |")
+    print("|---|" + "---|" * (len(SUFFIXES) + 3))
     for name, part in {**parts, "whole scene": surfels}.items():
         item = ExportItem(name, part, torch.zeros(len(part), dtype=torch.int32), views)
         cells = []
         with tempfile.TemporaryDirectory() as folder:
-            for kind, read in READERS.items():
-                path = Path(folder) / kind
+            for kind, suffix in SUFFIXES.items():
+                path = Path(folder) / f"file.{suffix}"
                 make_exporter(kind).write(path, item)
                 size = f"{path.stat().st_size / 1000:.1f} KB"
                 cells.append(size if kind == "ply" else f"{size}, {psnr(part, read(path), cameras, views):.1f}")

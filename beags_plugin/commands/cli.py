@@ -20,6 +20,7 @@ from beags_plugin.commands.starting import check_arguments, starting
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.pose_options import PoseOptions
+from beags_plugin.export.splat_options import SplatOptions
 from beags_plugin.pictures.options import RenderOptions
 from beags_plugin.system.errors import UserError, refused, silence_libraries
 from beags_plugin.system.pasted import quoted
@@ -190,11 +191,13 @@ class Export:
     mark as invented; .stl and .3mf are always closed."""
     pose: tyro.conf.OmitArgPrefixes[PoseOptions] = PoseOptions()
     mesh: tyro.conf.OmitArgPrefixes[MeshOptions] = MeshOptions()
+    splats: tyro.conf.OmitArgPrefixes[SplatOptions] = SplatOptions()
 
     def run(self) -> None:
         with starting(self):
             from beags_plugin.plugin.objects.export import export_run
         options = {name: asdict(self.mesh) for name in ("glb", "usdz", "obj", "stl", "3mf")}
+        options |= self.splats.of_formats()
         sentences: list[str] = []
         with progress_bar("exporting") as progress:
             exported = export_run(

@@ -1,7 +1,8 @@
-"""Gaussians as .spz, version 2: several times smaller than a .ply.
+"""Gaussians as .spz, version 3 or 4: several times smaller than a .ply.
 
-Written from the format's public description (nianticlabs/spz, README): gzip of a header of 16 bytes, then, each for all
-Gaussians: positions (24-bit fixed point), alphas, colours, scales, rotations and spherical harmonics (8 bits each).
+Written from the format's public description (nianticlabs/spz, README). Its parts, each for all Gaussians: positions
+(24-bit fixed point), alphas, colours, scales, rotations (32 bits) and spherical harmonics (the others 8 bits each).
+Version 3 is gzip of a header of 16 bytes and the parts; version 4 a header of 32 bytes, a table, and zstd of each part.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import gzip
 import math
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,14 +20,17 @@ import torch
 
 from beags_plugin.core.surfels import Surfels, opacities
 from beags_plugin.export.base import Exporter, ExportItem
-from beags_plugin.export.splat_values import finite_surfels
+from beags_plugin.export.splat_values import finite_surfels, smallest_three
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.frames import to_input_frame
 from beags_plugin.extraction.ply import THICKNESS
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.zstd import zstandard
 
 MAGIC = 0x5053474E
-VERSION = 2
+VERSIONS = (3, 4)
+_HEADER = 32  # bytes of version 4's
+_EFFORT = 12  # of zstd, of 22: more takes much longer for a percent
 _MOST = 2**23 - 1  # a signed 24-bit number
 _COLOR_SCALE = 0.15  # the format's: bytes hold 0.5 + 0.15 dc, so that colours a little out of range survive
 
@@ -37,25 +42,35 @@ class SpzExporter(Exporter):
     Like the tools that make .spz of .ply, it turns the axes of splat .ply files (y down, z forward) to the format's own
     (y up, z backward), half a turn about x; readers turn them back.
 
-    first_band_bits, other_bands_bits: of the SH degrees; fewer compress better.
+    version: 3, which most readers know, or 4, a little smaller, for which zstandard is needed. first_band_bits,
+    other_bands_bits: of the SH degrees; fewer compress better.
     """
 
     suffix: ClassVar[str] = "spz"
+    version: int = 3
     first_band_bits: int = 5
     other_bands_bits: int = 4
 
     def __post_init__(self) -> None:
+        if self.version not in VERSIONS:
+            raise UserError(f"the version of .spz is {self.version}: it must be 3 or 4.")
         for name in ("first_band_bits", "other_bands_bits"):
             if not 1 <= getattr(self, name) <= 8:
                 raise UserError(f"{name} is {getattr(self, name)}: it must lie in 1..8.")
 
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
-        content, facts = self._content(item.surfels)
+        count, bits, degree, parts = self._parts(item.surfels)
+        if self.version == 4:
+            content = _streams(count, degree, bits, [part for part in parts if part or not count])
+        else:
+            header = struct.pack("<IIIBBBB", MAGIC, self.version, count, degree, bits, 0, 0)
+            content = gzip.compress(b"".join([header, *parts]), mtime=0)  # the same bytes at any time
         with whole_file(path) as part:
-            part.write_bytes(gzip.compress(content, mtime=0))  # the same bytes at any time
-        return facts
+            part.write_bytes(content)
+        return {"version": self.version, "fractional_bits": bits, "sh_degree": degree}
 
-    def _content(self, surfels: Surfels) -> tuple[bytes, dict[str, Any]]:
+    def _parts(self, surfels: Surfels) -> tuple[int, int, int, list[bytes]]:
+        """Return the number of Gaussians, the bits after the point, the degree, and the six parts."""
         half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0, 0.0], dtype=torch.float64))[:3]
         # Of a disc's own axes two are turned too, which leaves it as it is: so do those tools, and the .ply comes back.
         quats = surfels.quats.detach() * surfels.quats.new_tensor([1.0, 1.0, -1.0, -1.0])
@@ -67,8 +82,7 @@ class SpzExporter(Exporter):
         log_scales = turned.log_scales.double()
         thin = log_scales.amin(dim=1, keepdim=True) + math.log(THICKNESS)
         degree = turned.sh_degree
-        parts = (
-            struct.pack("<IIIBBBB", MAGIC, VERSION, len(turned), degree, bits, 0, 0),
+        parts = [
             np.ascontiguousarray(fixed).view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
             # 0 and 255 would be read as infinite logits; renderers skip what 1 shows, and cap alphas at 0.99
             _bytes(255.0 * opacities(turned.opacity_logits.double()), 1, 254),
@@ -76,8 +90,8 @@ class SpzExporter(Exporter):
             _bytes(16.0 * (torch.cat([log_scales, thin], dim=1) + 10.0)),
             _rotation_bytes(turned.quats.double()),
             self._sh_bytes(turned.sh_rest.double()),
-        )
-        return b"".join(parts), {"version": VERSION, "fractional_bits": bits, "sh_degree": degree}
+        ]
+        return len(turned), bits, degree, parts
 
     def _sh_bytes(self, rest: torch.Tensor) -> bytes:
         """Encode coefficients -1..1 as 0..255 with 0 at 128, rounded to the bits wanted; colour is the inner axis."""
@@ -98,10 +112,27 @@ def fractional_bits(reach: float) -> int:
 
 
 def _rotation_bytes(quats: torch.Tensor) -> bytes:
-    """Encode x, y, z of unit quaternions with w >= 0, each -1..1 as 0..255."""
-    unit = torch.nn.functional.normalize(quats, dim=1)
-    unit = torch.where(unit[:, :1] < 0, -unit, unit)
-    return _bytes(127.5 + 127.5 * unit[:, 1:])
+    """Encode unit quaternions as 32 bits: the largest component's place, then sign and 9 bits of each other.
+
+    The order is xyzw, the first in the highest bits. The largest is made positive and follows from the length, and the
+    others are at most sqrt(1/2).
+    """
+    unit = torch.nn.functional.normalize(quats, dim=1).cpu().numpy()[:, [1, 2, 3, 0]]
+    largest, others = smallest_three(unit)  # times sqrt(2): at most 1
+    words = largest.astype(np.uint32)
+    for value in others.T:
+        size = np.rint(511.0 * np.abs(value)).clip(0, 511).astype(np.uint32)
+        words = words << np.uint32(10) | (value < 0).astype(np.uint32) << np.uint32(9) | size
+    return words.astype("<u4").tobytes()
+
+
+def _streams(count: int, degree: int, bits: int, parts: Sequence[bytes]) -> bytes:
+    """Return the content of version 4: a header, a table of sizes, and each part compressed by itself."""
+    packer = zstandard().ZstdCompressor(level=_EFFORT)
+    packed = [packer.compress(part) for part in parts]
+    header = struct.pack("<IIIBBBBI12x", MAGIC, 4, count, degree, bits, 0, len(parts), _HEADER)
+    table = b"".join(struct.pack("<QQ", len(one), len(part)) for one, part in zip(packed, parts, strict=True))
+    return b"".join([header, table, *packed])
 
 
 def _bytes(values: torch.Tensor, least: int = 0, most: int = 255) -> bytes:

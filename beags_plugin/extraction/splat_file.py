@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from beags_plugin.core.densification import SH_C0
 from beags_plugin.core.flattening import Gaussians
+from beags_plugin.core.sh import MAX_DEGREE, num_sh_bases
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.ply import read_vertices
 from beags_plugin.system.reading.text import reason
@@ -17,18 +20,22 @@ from beags_plugin.system.reading.text import reason
 
 @dataclass(frozen=True)
 class SplatFile:
-    """Content of a .ply: N Gaussians with two or three scales, in float32, and class_ids [N] int32 if it has them."""
+    """Content of a .ply: N Gaussians with two or three scales, in float32, and class_ids [N] int32 if it has them.
+
+    remarks: sentences on what a reader must know of it, such as what it lacks.
+    """
 
     gaussians: Gaussians
     class_ids: Tensor | None
+    remarks: tuple[str, ...] = ()
 
 
 def read_splat_file(path: str | Path) -> SplatFile:
-    """Read the vertices of a splat .ply in the layout of 3DGS or 2DGS, binary or text.
+    """Read the vertices of a splat .ply in the layout of 3DGS, 2DGS or ns-export, binary or text.
 
-    Columns: x y z, f_dc_0..2, f_rest_* channel-major, opacity (logit), scale_0..1 or 0..2 (logs), rot_0..3 (wxyz),
-    class_id if there. Values are as they are, finite or not. Raises ``UserError`` if the file cannot be read, is no
-    splat .ply, or is shorter than its header says.
+    Columns: x y z, f_dc_0..2 (or red green blue), f_rest_* channel-major (whole bands; those above degree 3 are left
+    out), opacity (logit), scale_0..1 or 0..2 (logs), rot_0..3 (wxyz), class_id if there. Values are as they are, finite
+    or not. Raises ``UserError`` if the file cannot be read, is no splat .ply, or is shorter than its header says.
     """
     path = Path(path)
     try:
@@ -39,12 +46,16 @@ def read_splat_file(path: str | Path) -> SplatFile:
         raise UserError(f"{path} is not a splat .ply file ({reason(error)}): name one.") from error
     present = set(vertex.dtype.names or ())
     rest_count = sum(name.startswith("f_rest_") for name in present)
-    scale_count = 3 if "scale_2" in present else 2
-    if rest_count not in (0, 9, 24, 45):
+    degree = math.isqrt(1 + rest_count // 3) - 1
+    if rest_count != 3 * (num_sh_bases(degree) - 1):
         raise UserError(
-            f"{path} has {rest_count} f_rest columns, but 0, 9, 24 or 45 make whole colour bands: export it again."
+            f"{path} has {rest_count} f_rest columns, but 0, 9, 24, 45 or 72 make whole colour bands: export it again."
         )
-    blocks = [("x", "y", "z"), numbered("f_dc", 3), ("opacity",), numbered("scale", scale_count)]
+    colors = numbered("f_dc", 3)
+    as_rgb = colors[0] not in present and "red" in present
+    if as_rgb:
+        colors = ("red", "green", "blue")
+    blocks = [("x", "y", "z"), colors, ("opacity",), numbered("scale", 3 if "scale_2" in present else 2)]
     blocks += [numbered("rot", 4), numbered("f_rest", rest_count)]
     if missing := sorted({name for block in blocks for name in block} - present):
         raise UserError(f"{path} is not a splat .ply file (it has no column {missing[0]!r}): name one.")
@@ -56,9 +67,24 @@ def read_splat_file(path: str | Path) -> SplatFile:
         return torch.from_numpy(table)
 
     means, dc, opacity, scales, quats, rest = (take(block) for block in blocks)
-    rest = rest.reshape(len(dc), 3, rest_count // 3).transpose(1, 2).contiguous()
+    rest = rest.reshape(len(dc), 3, rest_count // 3).transpose(1, 2)
+    remarks = []
+    if as_rgb:
+        dc = (_shares(dc, vertex.dtype["red"]) - 0.5) / SH_C0
+        if not rest_count:
+            remarks.append("It has colours as red, green and blue: each Gaussian has one colour from all sides.")
+    if degree > MAX_DEGREE:
+        remarks.append(f"Its colours have bands up to degree {degree}, of which those above {MAX_DEGREE} are left out.")
+    rest = rest[:, : num_sh_bases(MAX_DEGREE) - 1].contiguous()
     ids = torch.from_numpy(np.array(vertex["class_id"], dtype=np.int32)) if "class_id" in present else None
-    return SplatFile(Gaussians(means, quats, scales, opacity[:, 0], dc, rest), ids)
+    return SplatFile(Gaussians(means, quats, scales, opacity[:, 0], dc, rest), ids, tuple(remarks))
+
+
+def _shares(colors: Tensor, kind: np.dtype) -> Tensor:
+    """Return colours [N, 3] as shares of 1: integers are shares of their type's range, floats above 1 of 255."""
+    if kind.kind in "ui":
+        return colors / float(np.iinfo(kind).max)
+    return colors / 255.0 if bool((colors > 1.0).any()) else colors
 
 
 def numbered(prefix: str, count: int) -> tuple[str, ...]:

@@ -7,6 +7,10 @@ IMPORTERS = Registry(
     "beags.importers",
     {
         "ply": "beags_plugin.importers.ply:PlyImporter",
+        "compressed-ply": "beags_plugin.importers.compressed_ply:CompressedPlyImporter",
+        "spz": "beags_plugin.importers.spz:SpzImporter",
+        "splat": "beags_plugin.importers.splat:SplatImporter",
+        "sog": "beags_plugin.importers.sog:SogImporter",
         "checkpoint": "beags_plugin.importers.checkpoint:CheckpointImporter",
     },
 )

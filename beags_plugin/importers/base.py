@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
 from torch import Tensor
 
 from beags_plugin.core.flattening import Gaussians
+from beags_plugin.importers.activation import StartValues, stored_values
 from beags_plugin.system.errors import UserError
+
+_OTHERS = {".ksplat": "splat-transform {path} {stem}.ply", ".lcc": "splat-transform {path} {stem}.ply"}
+"""Commands of other programs that turn formats which no importer reads into one of those that are read."""
 
 
 @dataclass(frozen=True)
@@ -20,13 +24,19 @@ class ImportedScene:
     kind: its name for users, as in "3DGS .ply". gaussians: N, flat or with volume; not yet checked for odd values.
     normalization: None if the file lies in the world of the input poses; else ([3, 4] float64 R | t, scale) of the
     frame x' = scale (R x + t) that it lies in.
-    note: a sentence that the user should read, or "".
+    note: a sentence that the user should read if the scene is taken to lie in this run's own frame, or "".
+    remarks: other sentences for the user: what the format has lost, and what was assumed.
+    free_values: whether no specification says what scales and opacities are, and some programs write them activated.
+    doubtful_axes: whether programs disagree on the axes of the format, so that the scene may be a quarter turned.
     """
 
     kind: str
     gaussians: Gaussians
     normalization: tuple[Tensor, float] | None = None
     note: str = ""
+    remarks: tuple[str, ...] = ()
+    free_values: bool = False
+    doubtful_axes: bool = False
 
 
 class Importer(ABC):
@@ -43,7 +53,7 @@ class Importer(ABC):
 
     @abstractmethod
     def read(self, path: Path) -> ImportedScene:
-        """Read the scene in ``path``; raise ``UserError`` if it cannot be read. Trust no counts and sizes."""
+        """Read the scene in float32. Raises ``UserError`` if it cannot be read, is damaged, or is something else."""
 
 
 def find_importer(path: Path) -> Importer:
@@ -54,12 +64,30 @@ def find_importer(path: Path) -> Importer:
     from beags_plugin.importers import IMPORTERS
 
     if not path.exists():
-        raise UserError(f"{path} does not exist: name a .ply, a checkpoint or a run to start from.")
+        raise UserError(f"{path} does not exist: name a splat file, a checkpoint or a run to start from.")
     importers: dict[str, Importer] = {name: IMPORTERS.get(name)() for name in IMPORTERS.names()}
     fitting = [name for name, importer in importers.items() if importer.recognises(path)]
     if not fitting:
+        if (command := _OTHERS.get(path.suffix.lower())) is not None:
+            command = command.format(path=path.name, stem=path.stem)
+            raise UserError(f"{path} is of a format that is not read: convert it first, as by {command}")
         known = "; ".join(importer.marks for importer in importers.values())
         raise UserError(f"{path} is nothing to start from: name one of these: {known}.")
     if len(fitting) > 1:
         raise UserError(f"{path} can be read as {' or '.join(fitting)}: export it as a .ply and name that.")
     return importers[fitting[0]]
+
+
+def read_scene(path: Path, values: StartValues = "auto") -> ImportedScene:
+    """Read the scene that ``path`` holds, its scales as logs and its opacities as logits, whatever its writer made.
+
+    values: what they are in the file; "auto": what their ranges say. Raises ``UserError`` as ``find_importer`` and
+    ``Importer.read``, and where the ranges say nothing.
+    """
+    scene = find_importer(path).read(path)
+    if scene.free_values:
+        gaussians, remarks = stored_values(path, scene.gaussians, values)
+        return replace(scene, gaussians=gaussians, remarks=(*scene.remarks, *remarks))
+    if values != "auto":
+        raise UserError(f"{path} ({scene.kind}) says itself what its scales and opacities are: leave start-values out.")
+    return scene

@@ -277,12 +277,13 @@ def test_the_transform_of_a_run_is_checked(tmp_path):
 
 
 def test_importers_are_chosen_by_what_the_file_is(tmp_path):
-    assert IMPORTERS.names() == ["checkpoint", "ply"]
+    assert {"checkpoint", "ply", "compressed-ply", "spz", "splat", "sog"} <= set(IMPORTERS.names())
     write_ply(tmp_path / "scene.PLY", random_surfels())
     assert isinstance(find_importer(tmp_path / "scene.PLY"), PlyImporter)
-    (tmp_path / "scene.spz").touch()
-    with pytest.raises(UserError, match="is nothing to start from: name one of these"):
-        find_importer(tmp_path / "scene.spz")
+    for name, words in (("scene.obj", "is nothing to start from: name one of these"), ("a.ksplat", "convert it first")):
+        (tmp_path / name).touch()
+        with pytest.raises(UserError, match=words):
+            find_importer(tmp_path / name)
     with pytest.raises(UserError, match="holds no checkpoint"):
         CheckpointImporter().read(tmp_path)
 

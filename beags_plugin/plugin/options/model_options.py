@@ -48,11 +48,13 @@ class BeagsModelConfig(ModelConfig):
     """Whether each training photo gets an affine colour transform of its own, learned with the scene, which then has
     the mean photo's exposure; auto: where points that photos share tell that these differ."""
     start_from: Path | None = None
-    """A trained scene to start from instead of seed points: a 3DGS or 2DGS .ply, or a run of splatfacto or beags. 3D
-    Gaussians are flattened. base_steps then polish it, without growth."""
+    """A trained scene to start from instead of seed points: a splat file (docs/export.md), or a run of splatfacto or
+    beags. 3D Gaussians are flattened. base_steps then polish it, without growth."""
     start_frame: Literal["auto", "world", "normalised"] = "auto"
-    """Frame of start_from: world, that of the input poses; normalised, that of this run; auto: world for a .ply, and
+    """Frame of start_from: world, that of the input poses; normalised, that of this run; auto: world for a file, and
     for a run what its dataparser_transforms.json says."""
+    start_values: Literal["auto", "logs", "activated"] = "auto"
+    """Scales and opacities of a .ply to start from: logs and logits, or activated; auto: what their ranges say."""
     base_steps: int = 30_000
     """Steps of base training; 0 for a refinement that starts from a loaded base."""
     refine_steps: int = 3_000

@@ -18,9 +18,10 @@ from beags_plugin.core.flattening import flatten, without_empty_bands
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.extraction.far_worlds import double_means, origin_of
 from beags_plugin.extraction.frames import from_input_frame, to_input_frame
-from beags_plugin.importers.base import ImportedScene, find_importer
+from beags_plugin.importers.base import ImportedScene, read_scene
 from beags_plugin.losses.photometric import psnr
 from beags_plugin.plugin.training.scene_model import SceneModel
+from beags_plugin.plugin.training.start_axes import turned_to_fit
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.plugin.views.views import View
 from beags_plugin.rasterizers.rendering import surfel_inputs
@@ -45,7 +46,7 @@ def start_from_scene(model: SceneModel, datamanager: BeagsDataManager, run: Path
     config = model.config
     assert config.start_from is not None
     path = Path(config.start_from)
-    scene = find_importer(path).read(path)
+    scene = read_scene(path, config.start_values)
     usable = scene.gaussians.usable()
     if not bool(usable.any()):
         raise UserError(f"{path} holds no Gaussian that can be used: name another scene.")
@@ -60,22 +61,41 @@ def start_from_scene(model: SceneModel, datamanager: BeagsDataManager, run: Path
     frames = frames if config.start_frame == "auto" else (config.start_frame,)
     candidates: dict[StartFrame, Surfels] = {name: _moved(surfels, scene, name, ours, means) for name in frames}
     frame = frames[0]
-    fit = _measure(model, candidates[frame], views)
+    fit, turn = _measure(model, candidates[frame], views), ""
+    if scene.doubtful_axes and _poor(fit):
+        words, turned, found = turned_to_fit(
+            surfels,
+            lambda scene_turned: _moved(scene_turned, scene, frame, ours),
+            lambda scene_moved: _measure(model, scene_moved, views, most=8)["psnr"],
+        )
+        if found > fit["psnr"] + _BETTER_DB:
+            turn, candidates[frame] = words, turned
+            before, fit = fit["psnr"], _measure(model, turned, views)
+            scene = replace(
+                scene,
+                remarks=(*scene.remarks, f"Its axes fit these poses after {turn} ({before:.1f} dB as it stands)."),
+            )
     model.replace_surfels(candidates[frame])
     report = {
         "from": str(path.absolute()),
         "kind": scene.kind,
         "frame": _frame_name(frame, scene),
+        **({"turned": turn} if turn else {}),
         "gaussians": len(surfels),
         "dropped": int((~usable).sum()),
         "flattening": None if lost is None else vars(lost),
+        "remarks": list(scene.remarks),
         **fit,
     }
     for line in _description(path, scene, report):
         CONSOLE.print(f"  {line}", markup=False, highlight=False, soft_wrap=True)
-    if fit["psnr"] < fit["flat_psnr"] + _POOR_DB:
+    if _poor(fit):
         _warn_of_poor_fit(model, path, fit, candidates, views)
     write_text_atomically(json.dumps(report, indent=2), run / START_REPORT)
+
+
+def _poor(fit: dict[str, Any]) -> bool:
+    return fit["psnr"] < fit["flat_psnr"] + _POOR_DB
 
 
 def _frame_name(frame: StartFrame, scene: ImportedScene) -> str:
@@ -148,8 +168,7 @@ def _description(path: Path, scene: ImportedScene, report: dict[str, Any]) -> li
     dropped = report["dropped"]
     counted = f"{report['gaussians']:,} Gaussians" + (f" ({dropped:,} dropped: not finite)" if dropped else "")
     lines = [f"start: {path} ({scene.kind}), {counted}, frame: {report['frame']}"]
-    if scene.note:
-        lines.append(scene.note)
+    lines += [sentence for sentence in (scene.note, *scene.remarks) if sentence]
     if (lost := report["flattening"]) is not None:
         lines.append(
             f"flattened along the thinnest axis, which is {lost['median_ratio']:.3f} of the second (median); "

@@ -65,15 +65,23 @@ def read_vertices(path: Path) -> np.ndarray:
     The array of a binary file may be a read-only view of the file. Raises ``OSError`` if the file cannot be read,
     ``UserError`` if it is shorter than its header says, and ``ValueError`` with the reason if it is no .ply.
     """
+    found = read_element(path, "vertex")
+    if found is None:
+        raise ValueError("'vertex' is missing")
+    return found
+
+
+def read_element(path: Path, name: str) -> np.ndarray | None:
+    """Read any element of a .ply as ``read_vertices`` does; None if it has no such element."""
     header = _read_header(path)
     _check_size(path, header)
     before: list[_Element] = []
     for element in header.elements:
-        if element.name == "vertex":
+        if element.name == name:
             break
         before.append(element)
     else:
-        raise ValueError("'vertex' is missing")
+        return None
     if header.order == "":
         return _from_text(path, header, before, element)
     if not element.has_lists() and not any(other.has_lists() for other in before):
@@ -89,9 +97,10 @@ def read_vertices(path: Path) -> np.ndarray:
         return _rows(file, element, header.order)
 
 
-def write_vertices(file: BinaryIO, table: np.ndarray) -> None:
+def write_vertices(file: BinaryIO, table: np.ndarray, comment: str = "") -> None:
     """Write a structured array [N] of little-endian numbers as the vertices of a binary .ply."""
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    lines = ["ply", "format binary_little_endian 1.0", *([f"comment {comment}"] if comment else [])]
+    lines.append(f"element vertex {len(table)}")
     lines += [f"property {_NAMES[table.dtype[name].str[1:]]} {name}" for name in table.dtype.names or ()]
     file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
     file.write(np.ascontiguousarray(table).data)

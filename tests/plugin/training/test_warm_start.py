@@ -183,7 +183,7 @@ def test_base_steps_polish_a_scene_without_growth(scene, tmp_path):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("absent.ply", "absent.ply does not exist: name a .ply, a checkpoint or a run to start from"),
+        ("absent.ply", "absent.ply does not exist: name a splat file, a checkpoint or a run to start from"),
         ("notes.txt", "notes.txt is nothing to start from: name one of these: a run of splatfacto or beags"),
     ],
 )

@@ -1,0 +1,109 @@
+"""Scales and opacities that a program wrote after activation: lengths instead of logs, 0..1 instead of logits.
+
+No specification of splat .ply files forbids it. The ranges tell: logits of a trained scene leave 0..1, and logs of
+scales are negative below one unit of length.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.core.flattening import Gaussians
+from beags_plugin.system.errors import UserError
+
+StartValues = Literal["auto", "logs", "activated"]
+
+_ENOUGH = 32  # Gaussians of which the opacities alone tell something
+_SAMPLE = 4096  # Gaussians whose nearest neighbours are looked for
+_FITTING = (0.02, 50.0)  # the median scale over the median distance to the nearest neighbours of trained scenes
+_SPREAD = 0.3  # least standard deviation of the logs of a trained scene's scales
+_THINNEST = 1e-12  # units of length: of scales that are 0, as writers of discs leave the third
+
+
+def stored_values(path: Path, gaussians: Gaussians, values: StartValues) -> tuple[Gaussians, tuple[str, ...]]:
+    """Return the Gaussians with logs of scales and logits of opacities, and sentences on what was converted.
+
+    gaussians: N, their scales and opacities as they stand in ``path``. Raises ``UserError`` where ``values`` is "auto"
+    and the ranges fit both.
+    """
+    if values == "logs":
+        return gaussians, ()
+    if values == "activated":
+        scales, opacities = True, True
+    else:
+        opacities = _opacities_activated(gaussians)
+        scales = _scales_activated(path, gaussians, opacities)
+        opacities = opacities and (scales or _tells_much(gaussians.opacity_logits))
+    found = " and ".join(name for name, there in (("scales", scales), ("opacities", opacities)) if there)
+    if not found:
+        return gaussians, ()
+    if scales:
+        gaussians = replace(gaussians, log_scales=gaussians.log_scales.clamp_min(_THINNEST).log())
+    if opacities:
+        gaussians = replace(gaussians, opacity_logits=torch.logit(gaussians.opacity_logits.clamp(0.0, 1.0)))
+    if values == "activated":
+        return gaussians, ()
+    return gaussians, (
+        f"Its {found} lie where activated values do, so they are converted "
+        "(--pipeline.model.start-values logs takes them as logs and logits).",
+    )
+
+
+def _finite(values: Tensor) -> Tensor:
+    return values[values.isfinite()]
+
+
+def _opacities_activated(gaussians: Gaussians) -> bool:
+    values = _finite(gaussians.opacity_logits)
+    return len(values) > 0 and bool(((values >= 0) & (values <= 1)).all())
+
+
+def _tells_much(values: Tensor) -> bool:
+    """Return whether there are so many different values that their range is no accident."""
+    return len(_finite(values).unique()) >= _ENOUGH
+
+
+def _scales_activated(path: Path, gaussians: Gaussians, opacities: bool) -> bool:
+    """Return whether the scales are lengths; opacities: whether the opacities may be activated.
+
+    All logs of a scene are positive where its unit is far smaller than its Gaussians, such as the millimetre. Lengths
+    are then told from logs by the distances between neighbours, which Gaussians are about as large as, and as sizes
+    differ: small lengths taken as logs would make all Gaussians as large as one another, and round.
+    """
+    values = _finite(gaussians.log_scales)
+    if len(values) == 0 or bool((values < 0).any()):
+        return False
+    if opacities:
+        return True
+    apart = _spacing(gaussians.means)
+    if not apart > 0:
+        return False
+    fits = {}
+    for kind, logs in (("lengths", gaussians.log_scales.clamp_min(_THINNEST).log()), ("logs", gaussians.log_scales)):
+        middle = float(_finite(logs[:, :2].amax(dim=1)).median())
+        near = _FITTING[0] < math.exp(min(middle, 700.0)) / apart < _FITTING[1]
+        fits[kind] = near and float(_finite(logs[:, :2]).std()) > _SPREAD
+    if fits["lengths"] and fits["logs"]:
+        raise UserError(
+            f"the scales of {path} are all positive and fit both as logs and as lengths: say which with "
+            "--pipeline.model.start-values logs or activated."
+        )
+    return fits["lengths"]
+
+
+def _spacing(means: Tensor) -> float:
+    """Return the median distance from a Gaussian to its nearest other one; 0 where there are fewer than two."""
+    from scipy.spatial import KDTree
+
+    points = means[means.isfinite().all(dim=1)].double().cpu().numpy()
+    if len(points) < 2:
+        return 0.0
+    chosen = np.random.default_rng(0).choice(len(points), min(_SAMPLE, len(points)), replace=False)
+    return float(np.median(KDTree(points).query(points[chosen], 2)[0][:, 1]))
