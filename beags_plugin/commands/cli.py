@@ -173,8 +173,9 @@ class Export:
     whole: bool = False
     """The whole scene in one file; without --object and --all it needs no classes."""
     format: tuple[str, ...] = ("ply",)
-    """ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), spz, compressed-ply, sog (all small), html (a
-    page to send), glb, usdz, obj (meshes), stl, 3mf (to print), or your own."""
+    """ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), spz, compressed-ply, sog (all small),
+    gltf-splats, gltf-both (splats and mesh), html (a page to send), glb, usdz, obj (meshes), stl, 3mf (to print), or
+    your own."""
     frame: str = "world"
     """world, that of the input poses; or object, the same with the middle of the object's box as origin."""
     output: Path | None = None
@@ -196,7 +197,7 @@ class Export:
     def run(self) -> None:
         with starting(self):
             from beags_plugin.plugin.objects.export import export_run
-        options = {name: asdict(self.mesh) for name in ("glb", "usdz", "obj", "stl", "3mf")}
+        options = {name: asdict(self.mesh) for name in ("glb", "gltf-both", "usdz", "obj", "stl", "3mf")}
         options |= self.splats.of_formats()
         sentences: list[str] = []
         with progress_bar("exporting") as progress:

@@ -11,6 +11,8 @@ EXPORTERS = Registry(
         "compressed-ply": "beags_plugin.export.compressed_ply:CompressedPlyExporter",
         "sog": "beags_plugin.export.sog:SogExporter",
         "spz": "beags_plugin.export.spz:SpzExporter",
+        "gltf-splats": "beags_plugin.export.gltf_splats:GltfSplatsExporter",
+        "gltf-both": "beags_plugin.export.gltf_splats:GltfBothExporter",
         "html": "beags_plugin.export.web_page:WebPageExporter",
         "glb": "beags_plugin.export.mesh:GlbExporter",
         "usdz": "beags_plugin.export.usdz:UsdzExporter",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -57,6 +57,7 @@ class ExportItem:
     in_metres: whether the frame's unit is a metre; else it is unknown.
     close: whether meshes shall be closed where no photo shows the item.
     invented: [N] bool, surfels that close it there; None where it was not asked to be closed.
+    class_names: of the ids among ``class_ids``, for files that hold several objects.
     shared: what exporters of one item keep for each other, such as the mesh that two file types hold.
     on_render: is called, by an exporter that ``needs_views``, with the number of views rendered so far.
     """
@@ -72,6 +73,7 @@ class ExportItem:
     in_metres: bool = False
     close: bool = False
     invented: Tensor | None = None
+    class_names: Mapping[int, str] = field(default_factory=dict)
 
 
 class Exporter(ABC):

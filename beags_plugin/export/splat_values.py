@@ -35,11 +35,16 @@ class SplatValues:
         return len(self.means)
 
 
-def finite_surfels(surfels: Surfels) -> Surfels:
-    """Return the surfels without those of which a parameter is not finite."""
+def finite_mask(surfels: Surfels) -> torch.Tensor:
+    """Return [N] bool, the surfels of which every parameter is finite."""
     values = (surfels.means, surfels.quats, surfels.log_scales, surfels.sh)
     finite = torch.cat([value.detach().flatten(1) for value in values], dim=1).isfinite().all(dim=1)
-    return surfels[finite & surfels.opacity_logits.isfinite()]
+    return finite & surfels.opacity_logits.isfinite()
+
+
+def finite_surfels(surfels: Surfels) -> Surfels:
+    """Return the surfels without those of which a parameter is not finite."""
+    return surfels[finite_mask(surfels)]
 
 
 def splat_values(surfels: Surfels, name: str) -> SplatValues:

@@ -17,7 +17,8 @@ import numpy as np
 from beags_plugin.export.base import ExportItem
 from beags_plugin.export.color import linear_from_srgb
 from beags_plugin.export.fusion import Mesh
-from beags_plugin.export.glb import png_bytes, y_up
+from beags_plugin.export.glb import png_bytes
+from beags_plugin.export.gltf import y_up
 from beags_plugin.export.mesh import TexturedExporter
 from beags_plugin.export.surface import vertex_normals
 from beags_plugin.export.texture import Texture

@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from beags_plugin.core.flattening import Gaussians
 from beags_plugin.core.rotations import quat_product
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
@@ -66,6 +67,17 @@ def _turned(surfels: Surfels, means: Tensor, rotation: Tensor, factor: float) ->
         opacity_logits=surfels.opacity_logits.detach(),
         sh=rotate_sh(surfels.sh.detach(), rotation, surfels.sh_degree),
     )
+
+
+def turned_gaussians(gaussians: Gaussians, rotation: Tensor, factor: float = 1.0) -> Gaussians:
+    """Return Gaussians as files hold them turned by ``rotation`` [3, 3] about the origin and ``factor`` times as large.
+
+    Raises ``UserError`` if the matrix is no rotation.
+    """
+    transform = torch.cat([rotation.double(), torch.zeros(3, 1, dtype=torch.float64)], dim=1)
+    rotation, _ = _checked(transform, factor, gaussians.means)
+    means = factor * (gaussians.means.double() @ rotation.T)
+    return Gaussians(**vars(_turned(Surfels(**vars(gaussians)), means, rotation, factor)))
 
 
 def quat_from_rotation(rotation: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ IMPORTERS = Registry(
         "compressed-ply": "beags_plugin.importers.compressed_ply:CompressedPlyImporter",
         "spz": "beags_plugin.importers.spz:SpzImporter",
         "splat": "beags_plugin.importers.splat:SplatImporter",
+        "gltf": "beags_plugin.importers.gltf:GltfImporter",
         "sog": "beags_plugin.importers.sog:SogImporter",
         "checkpoint": "beags_plugin.importers.checkpoint:CheckpointImporter",
     },

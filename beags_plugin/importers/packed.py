@@ -5,8 +5,9 @@ from __future__ import annotations
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,12 @@ from torch import Tensor
 
 from beags_plugin.core.flattening import Gaussians
 from beags_plugin.core.sh import MAX_DEGREE, num_sh_bases
+from beags_plugin.extraction.frames import turned_gaussians
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import reason
 
 _DAMAGED = (ValueError, LookupError, TypeError, OverflowError, EOFError, MemoryError, struct.error, zlib.error)
+_UNEVEN = 1e-3  # by which axes of a matrix may differ in length or from right angles
 MOST_ZIPPED = 1032  # bytes that one byte of deflate can stand for
 
 
@@ -67,3 +70,27 @@ def cut_bands(degree: int) -> tuple[str, ...]:
     if degree <= MAX_DEGREE:
         return ()
     return (f"Its colours have bands up to degree {degree}, of which those above {MAX_DEGREE} are left out.",)
+
+
+def joined(parts: Sequence[Gaussians]) -> Gaussians:
+    """Return the Gaussians of all parts, one after the other; bands that a part lacks are 0."""
+    width = max(part.sh_rest.shape[1] for part in parts)
+
+    def values(part: Gaussians, name: str) -> Tensor:
+        found = getattr(part, name)
+        if name == "sh_rest":
+            return torch.cat([found, found.new_zeros(len(found), width - found.shape[1], 3)], dim=1)
+        return found
+
+    return Gaussians(**{name: torch.cat([values(part, name) for part in parts]) for name in vars(parts[0])})
+
+
+def moved_by(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
+    """Return Gaussians moved by a matrix [4, 4], which turns, shifts and scales alike; else raises ``ValueError``."""
+    linear = matrix[:3, :3]
+    factor = float(np.cbrt(np.linalg.det(linear)))
+    if not factor > 0 or np.abs(linear @ linear.T / factor**2 - np.eye(3)).max() > _UNEVEN:
+        raise ValueError("a node stretches or mirrors its Gaussians: apply its transform where the file was made")
+    u, _, vt = np.linalg.svd(linear)
+    turned = turned_gaussians(gaussians, torch.from_numpy(u @ vt), factor)
+    return replace(turned, means=(turned.means.double() + torch.from_numpy(matrix[:3, 3].copy())).float())

@@ -128,7 +128,7 @@ class ExportJob:
         item = ExportItem(
             name, frame.surfels(chosen), class_ids, views, on_render=steps.on_render, photos=photos,
             no_photos=no_photos, in_metres=self.metres is not None,
-            close=self.closing is not None and class_id not in (None, BACKGROUND),
+            close=self.closing is not None and class_id not in (None, BACKGROUND), class_names=self.scene.classes,
         )  # fmt: skip
         of_splats, added = item, None
         if self.closing is not None and self._adds_gaussians():

@@ -284,6 +284,13 @@ def test_extract_and_export_write_the_same_ply(trained, tmp_path):
     assert (tmp_path / "cup.ply").read_bytes() == (tmp_path / "runs/cup/cup.ply").read_bytes()
 
 
+def test_the_whole_scene_is_a_gltf_with_a_node_for_each_class(trained, tmp_path):
+    main(["export", "--load-config", str(trained), "--whole", "--format", "gltf-splats", "--output", str(tmp_path)])
+    data = (tmp_path / "whole_scene.splats.glb").read_bytes()
+    content = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    assert {node["extras"]["class_id"]: node["name"] for node in content["nodes"]} == CLASSES
+
+
 def test_an_object_called_as_the_whole_scene_has_a_file_of_its_own(trained, tmp_path, monkeypatch):
     monkeypatch.setattr(export, "WHOLE", "Cup")
     main(["export", "--load-config", str(trained), "--object", "cup", "--whole", "--output", str(tmp_path)])

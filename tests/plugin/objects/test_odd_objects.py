@@ -18,6 +18,7 @@ pytest.importorskip("nerfstudio")
 
 from beags_plugin.commands.cli import main
 from beags_plugin.extraction.ply import read_ply
+from beags_plugin.importers.base import read_scene
 from beags_plugin.plugin.runs.place import open_run
 from beags_plugin.plugin.runs.write import write_run
 from beags_plugin.system.reading.ply import read_vertices
@@ -89,6 +90,8 @@ OPENED: dict[str, Callable[[Path], bool]] = {
     "spz": lambda path: gzip.decompress(path.read_bytes())[8:12] == (10).to_bytes(4, "little"),
     "sog": lambda path: json.loads(zipfile.ZipFile(path).read("meta.json"))["count"] == 10,
     "html": lambda path: path.read_text("utf8").startswith("<!doctype html>"),
+    "gltf-splats": lambda path: len(read_scene(path).gaussians) == 10,
+    "gltf-both": lambda path: len(read_scene(path).gaussians) == 10,
     "glb": opened_mesh,
     "obj": opened_mesh,
     "stl": opened_mesh,
@@ -123,7 +126,7 @@ def test_an_object_of_ten_gaussians_is_a_file_that_opens_or_a_sentence(tmp_path,
     for name, path in written.items():
         assert OPENED[name](path), name
     for name, reason in refused.items():
-        assert name in ("glb", "usdz", "obj", "stl", "3mf") and f"no {name}: {reason}" in said
+        assert name in ("gltf-both", "glb", "usdz", "obj", "stl", "3mf") and f"no {name}: {reason}" in said
         assert "'cup'" in reason and reason.endswith(".") and ("is seen in 3" in reason or "encloses nothing" in reason)
     if kind == "a clump":
         assert {"glb", "3mf"} <= written.keys()
