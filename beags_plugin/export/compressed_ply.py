@@ -17,6 +17,7 @@ from beags_plugin.core.densification import SH_C0
 from beags_plugin.export.base import Exporter, ExportItem
 from beags_plugin.export.splat_values import SplatValues, smallest_three, splat_values
 from beags_plugin.extraction.files import whole_file
+from beags_plugin.extraction.ply import DISC_COMMENT
 
 CHUNK = 256  # Gaussians
 _SH_RANGE = 8.0  # coefficients of the higher bands lie in -4..4
@@ -72,7 +73,8 @@ def _packed(places: np.ndarray, bits: tuple[int, int, int]) -> np.ndarray:
 
 
 def _header(chunks: int, count: int, coefficients: int) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", "comment beags", f"element chunk {chunks}"]
+    lines = ["ply", "format binary_little_endian 1.0", "comment beags", f"comment {DISC_COMMENT}"]
+    lines.append(f"element chunk {chunks}")
     for of, axes in (("", "xyz"), ("scale_", "xyz"), ("", "rgb")):
         lines += [f"property float {end}_{of}{axis}" for end in ("min", "max") for axis in axes]
     lines.append(f"element vertex {count}")

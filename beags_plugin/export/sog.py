@@ -47,6 +47,7 @@ def sog(values: SplatValues) -> tuple[bytes, dict[str, Any]]:
     """Return the content of the file, and what the manifest says of it."""
     images: dict[str, np.ndarray] = {}
     meta = {"version": VERSION, "asset": {"generator": "beags"}, "count": len(values), "antialias": False}
+    meta["model"] = "2dgs"  # discs: readers that know it leave out the third scale
     meta["means"] = _means(values.means, images)
     largest, others = smallest_three(values.quats)
     rotations = np.rint(255.0 * (others / 2 + 0.5)).clip(0, 255)

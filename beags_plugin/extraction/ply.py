@@ -18,6 +18,8 @@ from beags_plugin.extraction.splat_file import numbered, read_splat_file
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.ply import write_vertices
 
+DISC_COMMENT = "SplatRenderMode: 2dgs"
+"""Comment of .ply files whose Gaussians are discs, which PlayCanvas' programs and Brush know."""
 THICKNESS = 1e-3
 """Written third scale, relative to the smaller of the two: flat, yet no viewer divides by 0."""
 
@@ -35,7 +37,7 @@ def write_ply(
     Columns: x y z; nx ny nz, the surfel's normal; f_dc_0..2; f_rest_* channel-major (red, then green, then blue);
     opacity as a logit; scale_0..2 as logs, the third ``THICKNESS`` times the smaller of the two for viewers of 3D
     Gaussians; rot_0..3 wxyz, unit length. 2DGS's layout has two scales and always 45 f_rest columns, padded with 0, as
-    the official code expects for its default SH degree 3.
+    the official code expects for its default SH degree 3, and a comment for PlayCanvas' programs.
 
     surfels: N surfels. class_ids: [N] integer, phi. transform: the dataparser's ([3, 4], scale); with it the
     file is in the frame of the input poses, without it in the surfels' own. invented: [N] bool, the last column, of
@@ -54,7 +56,7 @@ def write_ply(
     for name, values in columns.items():
         table[name] = values
     with whole_file(path) as part, open(part, "wb") as file:
-        write_vertices(file, table)
+        write_vertices(file, table, DISC_COMMENT if layout == "2dgs" else "")
 
 
 def _columns(surfels: Surfels, layout: str) -> dict[str, np.ndarray]:

@@ -7,12 +7,14 @@ into four 32-bit words; and "sh", a byte a coefficient of the higher bands. Olde
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
 from beags_plugin.core.densification import SH_C0
+from beags_plugin.extraction.ply import DISC_COMMENT
 from beags_plugin.importers.base import ImportedScene, Importer
 from beags_plugin.importers.packed import cut_bands, gaussians_of, reading, sh_degree, with_largest
 from beags_plugin.system.reading.ply import read_element
@@ -26,8 +28,12 @@ def is_compressed(path: Path) -> bool:
     """Return whether a file is a .ply whose header has the packed columns."""
     if not (path.is_file() and path.suffix.lower() == ".ply"):
         return False
+    return b"packed_position" in _header(path)
+
+
+def _header(path: Path) -> bytes:
     with path.open("rb") as file:
-        return b"packed_position" in file.read(_HEADER_BYTES).partition(b"end_header")[0]
+        return file.read(_HEADER_BYTES).partition(b"end_header")[0]
 
 
 class CompressedPlyImporter(Importer):
@@ -65,6 +71,8 @@ class CompressedPlyImporter(Importer):
                 (shown - 0.5) / SH_C0,
                 rest,
             )  # fmt: skip
+        if DISC_COMMENT.encode() in _header(path):
+            gaussians = replace(gaussians, log_scales=gaussians.log_scales[:, :2].contiguous())
         lost = "It is compressed: places, scales and rotations have 10 or 11 bits, colours and opacities 8."
         return ImportedScene("compressed .ply", gaussians, remarks=(lost, *cut_bands(sh_degree(rest.shape[1]))))
 

@@ -140,7 +140,8 @@ def test_what_is_exported_for_2dgs_has_its_columns_in_its_order(tmp_path, classe
     lines = path.read_bytes().partition(b"end_header\n")[0].decode("ascii").splitlines()
     properties = [f"property float {name}" for name in columns(2)]
     last = ["property int class_id"] if classes else []
-    assert lines == ["ply", "format binary_little_endian 1.0", "element vertex 7", *properties, *last]
+    head = ["ply", "format binary_little_endian 1.0", "comment SplatRenderMode: 2dgs", "element vertex 7"]
+    assert lines == [*head, *properties, *last]
     row = np.frombuffer(path.read_bytes().partition(b"end_header\n")[2][: 4 * len(properties)], "<f4")
     assert np.array_equal(row[:3], surfels.means[0].numpy()) and np.array_equal(row[6:9], surfels.sh_dc[0].numpy())
     assert np.array_equal(row[9:54].reshape(3, 15)[:, :8], surfels.sh_rest[0].T.numpy())
