@@ -174,8 +174,8 @@ class Export:
     """The whole scene in one file; without --object and --all it needs no classes."""
     format: tuple[str, ...] = ("ply",)
     """ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), spz, compressed-ply, sog (all small),
-    gltf-splats, gltf-both (splats and mesh), html (a page to send), glb, usdz, obj (meshes), stl, 3mf (to print), or
-    your own."""
+    gltf-splats, usdz-splats, usda-splats, gltf-both (splats and mesh), html (a page to send), glb, usdz, obj (meshes),
+    stl, 3mf (to print), or your own."""
     frame: str = "world"
     """world, that of the input poses; or object, the same with the middle of the object's box as origin."""
     output: Path | None = None
@@ -198,7 +198,7 @@ class Export:
         with starting(self):
             from beags_plugin.plugin.objects.export import export_run
         options = {name: asdict(self.mesh) for name in ("glb", "gltf-both", "usdz", "obj", "stl", "3mf")}
-        options |= self.splats.of_formats()
+        options |= self.splats.of_formats(self.mesh)
         sentences: list[str] = []
         with progress_bar("exporting") as progress:
             exported = export_run(

@@ -13,6 +13,8 @@ EXPORTERS = Registry(
         "spz": "beags_plugin.export.spz:SpzExporter",
         "gltf-splats": "beags_plugin.export.gltf_splats:GltfSplatsExporter",
         "gltf-both": "beags_plugin.export.gltf_splats:GltfBothExporter",
+        "usdz-splats": "beags_plugin.export.usd_splats:UsdzSplatsExporter",
+        "usda-splats": "beags_plugin.export.usd_splats:UsdaSplatsExporter",
         "html": "beags_plugin.export.web_page:WebPageExporter",
         "glb": "beags_plugin.export.mesh:GlbExporter",
         "usdz": "beags_plugin.export.usdz:UsdzExporter",

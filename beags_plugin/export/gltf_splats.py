@@ -19,16 +19,13 @@ from beags_plugin.export.base import Exporter, ExportItem
 from beags_plugin.export.glb import add_mesh
 from beags_plugin.export.gltf import FLOAT, UNSIGNED_BYTE, Document, positions
 from beags_plugin.export.mesh import TexturedExporter
-from beags_plugin.export.splat_parts import SplatPart, splat_parts, thin_log_scales, without_invented
+from beags_plugin.export.splat_parts import SplatPart, splat_parts, thin_log_scales, without_invented, y_up_surfels
 from beags_plugin.extraction.files import whole_file
-from beags_plugin.extraction.frames import from_input_frame
 from beags_plugin.extraction.ply import THICKNESS
 
 EXTENSION = "KHR_gaussian_splatting"
 _POINTS = 0
 _FACTS = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}  # its projection and sorting are the defaults
-Y_UP = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]], dtype=torch.float64)
-"""R | t of x' = R x + t from a frame with z up to one with y up: z of ours is its y, and y its -z."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +67,7 @@ def add_splats(document: Document, part: SplatPart, name: str = "") -> int:
 
     They have z up and the file y: places, rotations and colours are turned.
     """
-    turned = from_input_frame(part.surfels, Y_UP, 1.0)
+    turned = y_up_surfels(part.surfels)
     floats = {
         "ROTATION": (torch.nn.functional.normalize(turned.quats.double(), dim=1)[:, [1, 2, 3, 0]], "VEC4"),
         "SCALE": (thin_log_scales(turned, THICKNESS).exp(), "VEC3"),

@@ -11,6 +11,7 @@ from torch import Tensor
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import ExportItem, NothingToExport
 from beags_plugin.export.splat_values import finite_mask
+from beags_plugin.extraction.frames import from_input_frame
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,12 @@ def without_invented(item: ExportItem) -> ExportItem:
         return item
     own = ~item.invented
     return replace(item, surfels=item.surfels[own], class_ids=item.class_ids[own], invented=None)
+
+
+def y_up_surfels(surfels: Surfels) -> Surfels:
+    """Return surfels of a frame with z up in one with y up; z of ours is its y, and y its -z."""
+    quarter = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]]
+    return from_input_frame(surfels, torch.tensor(quarter, dtype=torch.float64), 1.0)
 
 
 def thin_log_scales(surfels: Surfels, thickness: float) -> Tensor:

@@ -51,44 +51,44 @@ class UsdzExporter(TexturedExporter):
         return made.facts() | {"texture": facts}
 
 
+def packed(layer: Path) -> bytes:
+    """Return the content of a .usdz of a layer and the files beside it that it names."""
+    Sdf, UsdUtils = modules("Sdf", "UsdUtils")
+    package = layer.with_suffix(".usdz")
+    if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(layer)), str(package)):
+        raise RuntimeError("Pixar's USD library packed nothing")
+    return package.read_bytes()
+
+
 def usdz_bytes(mesh: Mesh, name: str, texture: Texture | None = None, invented: np.ndarray | None = None) -> bytes:
     """Return the file's content; the mesh has z up and the file y. Its unit is the metre.
 
     invented: [V] bool; with it vertices have the primvar ``invented``, 1 where nothing but closing put them.
     """
-    Sdf, UsdUtils = _modules("Sdf", "UsdUtils")
     with tempfile.TemporaryDirectory() as folder:
-        layer, package = Path(folder) / "mesh.usdc", Path(folder) / "mesh.usdz"
+        layer = Path(folder) / "mesh.usdc"
         if texture is not None:
             (layer.parent / _PICTURE).write_bytes(png_bytes(texture.image))
         _write_layer(layer, mesh, name, texture, invented)
-        if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(layer)), str(package)):
-            raise RuntimeError("Pixar's USD library packed nothing")
-        return package.read_bytes()
+        return packed(layer)
 
 
-def _modules(*names: str) -> list[Any]:
+def modules(*names: str) -> list[Any]:
     """Return modules of Pixar's library, which tells no types."""
     return [import_module(f"pxr.{name}") for name in names]
 
 
 def _write_layer(path: Path, mesh: Mesh, name: str, texture: Texture | None, invented: np.ndarray | None) -> None:
-    Gf, Sdf, Usd, UsdGeom, Vt = _modules("Gf", "Sdf", "Usd", "UsdGeom", "Vt")
+    Sdf, Usd, UsdGeom, Vt = modules("Sdf", "Usd", "UsdGeom", "Vt")
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     root = UsdGeom.Xform.Define(stage, "/Object")
     root.GetPrim().SetDisplayName(name)
     stage.SetDefaultPrim(root.GetPrim())
-    shape = UsdGeom.Mesh.Define(stage, "/Object/Mesh")
     source = np.arange(len(mesh.vertices)) if texture is None else texture.atlas.source
     faces = mesh.faces if texture is None else texture.atlas.faces
-    places = y_up(mesh.vertices)[source].astype(np.float32)
-    shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(places))
-    shape.CreateExtentAttr([Gf.Vec3f(*map(float, bound)) for bound in (places.min(axis=0), places.max(axis=0))])
-    shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
-    shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.reshape(-1).astype(np.int32)))
-    shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    shape = define_mesh(stage, "/Object/Mesh", y_up(mesh.vertices)[source], faces)
     shape.CreateDoubleSidedAttr(True)
     shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(y_up(vertex_normals(mesh))[source].astype(np.float32)))
     shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
@@ -108,9 +108,21 @@ def _write_layer(path: Path, mesh: Mesh, name: str, texture: Texture | None, inv
     stage.GetRootLayer().Save()
 
 
+def define_mesh(stage: Any, path: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """Return a new mesh of a stage, of vertices [V, 3] in its frame and triangles [F, 3]."""
+    Gf, UsdGeom, Vt = modules("Gf", "UsdGeom", "Vt")
+    shape, places = UsdGeom.Mesh.Define(stage, path), vertices.astype(np.float32)
+    shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(places))
+    shape.CreateExtentAttr([Gf.Vec3f(*map(float, bound)) for bound in (places.min(axis=0), places.max(axis=0))])
+    shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
+    shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.reshape(-1).astype(np.int32)))
+    shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    return shape
+
+
 def _bind_material(stage: Any, shape: Any, textured: bool) -> None:
     """Give a mesh a material that emits its texture, or without one the colours of its vertices."""
-    Gf, Sdf, UsdShade = _modules("Gf", "Sdf", "UsdShade")
+    Gf, Sdf, UsdShade = modules("Gf", "Sdf", "UsdShade")
     kinds = Sdf.ValueTypeNames
     material = UsdShade.Material.Define(stage, "/Object/Material")
 

@@ -13,5 +13,6 @@ IMPORTERS = Registry(
         "gltf": "beags_plugin.importers.gltf:GltfImporter",
         "sog": "beags_plugin.importers.sog:SogImporter",
         "checkpoint": "beags_plugin.importers.checkpoint:CheckpointImporter",
+        "usd": "beags_plugin.importers.usd:UsdImporter",
     },
 )

@@ -92,6 +92,7 @@ OPENED: dict[str, Callable[[Path], bool]] = {
     "html": lambda path: path.read_text("utf8").startswith("<!doctype html>"),
     "gltf-splats": lambda path: len(read_scene(path).gaussians) == 10,
     "gltf-both": lambda path: len(read_scene(path).gaussians) == 10,
+    "usdz-splats": lambda path: len(read_scene(path).gaussians) == 10,
     "glb": opened_mesh,
     "obj": opened_mesh,
     "stl": opened_mesh,
