@@ -216,6 +216,32 @@ class Export:
 
 
 @dataclass
+class Clean:
+    """Refine a splat scene that another program trained, with its photos, and write it back in its own format.
+
+    Poses and masks are made where there are none, as by the demo. The report says what changed.
+    """
+
+    scene: tyro.conf.Positional[Path]
+    """The splat file: .ply, .spz, .sog, .splat, .glb, .usdz and others (docs/export.md), or a run of splatfacto."""
+    data: Path
+    """Folder of the photos, with the poses in whose world the scene lies, and id masks."""
+    objects: tuple[str, ...] = ()
+    """Names of objects that get a file of their own too."""
+    output: Path | None = None
+    """Folder for the files, the report and the run; outputs/<scene>_cleaned if left out."""
+    polish: int = 300
+    """Base steps before refinement that repair what flattening costs a scene of 3D Gaussians."""
+    steps: int | None = None
+    """Steps of refinement; those of beags-refine if left out."""
+
+    def run(self) -> None:
+        with starting(self):
+            from beags_plugin.commands.clean import clean_scene
+        clean_scene(self.scene, self.data, self.objects, self.output, self.polish, self.steps)
+
+
+@dataclass
 class Render:
     """Render objects: a turntable, a contact sheet, assignment alone beside the refined object, or a camera path.
 
@@ -342,7 +368,7 @@ def write_json(path: Path | None, content: object) -> None:
         write_text_atomically(json.dumps(content, indent=2, default=str) + "\n", path)
 
 
-Command = Demo | Process | Resume | Sample | Masks | Extract | Export | Render | Eval | Bench | Doctor
+Command = Demo | Process | Resume | Sample | Masks | Extract | Export | Clean | Render | Eval | Bench | Doctor
 
 
 def exit_with(error: UserError) -> NoReturn:

@@ -1,0 +1,98 @@
+"""``beags clean``: a scene of another program is refined and written back in its own format."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from random_surfels import random_surfels
+from run_folders import discs
+from start_scenes import write_start_scene
+from written_splats import read_back, write
+
+pytest.importorskip("nerfstudio")
+
+from beags_plugin.commands.cli import main
+from beags_plugin.export.closing_surfels import joined
+from beags_plugin.importers.base import read_scene
+from beags_plugin.plugin.objects.written_back import changes, format_of
+
+
+def test_a_scene_is_refined_and_written_back_in_its_format(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    scene = write_start_scene(tmp_path / "data")
+    write(tmp_path / "my scene.spz", "spz", scene.surfels)
+    arguments = ["clean", "my scene.spz", "--data", "data", "--polish", "1", "--steps", "2", "--objects"]
+    with pytest.raises(SystemExit):
+        main([*arguments, "cup"])
+    assert "there is no object 'cup'" in capsys.readouterr().out and not Path("outputs/my scene_cleaned/run").exists()
+    main([*arguments, "class_1"])
+    folder = Path("outputs/my scene_cleaned")
+    report = json.loads((folder / "clean.json").read_text())
+    assert report["files"] == [str(folder / "my scene.cleaned.spz"), str(folder / "my scene.class_1.spz")]
+    assert report["polish"] == 1 and report["start"]["psnr"] > 40
+    cleaned, alone = (read_scene(folder / f"my scene.{name}.spz") for name in ("cleaned", "class_1"))
+    assert cleaned.kind == ".spz version 3" and 0 < len(alone.gaussians) < len(cleaned.gaussians)
+    found = report["changes"]
+    assert (found["before"], found["after"]) == (75, len(cleaned.gaussians))
+    # in the frame of the file that came: what two steps have moved lies near what it was
+    before, after = scene.surfels.means, cleaned.gaussians.means
+    assert torch.cdist(after, before).amin(dim=1).median() < 0.02
+    out = " ".join(capsys.readouterr().out.split())
+    assert "75 Gaussians became" in out and "as it came (flattened: thinnest scale" in out and "after it: " in out
+    psnr = report["metrics"]["psnr"]
+    assert psnr["before"] > 30 and psnr["after"] > 30
+    with pytest.raises(SystemExit):
+        main(["clean", "my scene.spz", "--data", "data", "--output", "data", "--polish", "-1"])
+    (tmp_path / "mine/run").mkdir(parents=True)
+    with pytest.raises(SystemExit):
+        main(["clean", "my scene.spz", "--data", "data", "--output", "mine"])
+    assert "is not of beags clean" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "options"),
+    [
+        ("ply", "a.ply", {}),
+        ("ply-2dgs", "a.2dgs.ply", {}),
+        ("compressed-ply", "a.compressed.ply", {}),
+        ("sog", "a.sog", {}),
+        ("spz", "a.spz", {"version": 3}),
+        ("spz", "b.spz", {"version": 4}),
+        ("gltf-splats", "a.splats.glb", {}),
+        ("usdz-splats", "a.splats.usdz", {"kernel": "ellipsoid"}),
+        ("usda-splats", "a.splats.usda", {"kernel": "surflet"}),
+    ],
+)
+def test_every_format_is_written_back_as_it_came(tmp_path, kind, name, options):
+    if kind.startswith("usd"):
+        pytest.importorskip("pxr.UsdVol", reason="usd-core is not installed (pip install beags[usd])")
+    if options == {"version": 4}:
+        pytest.importorskip("zstandard")
+    path = write(tmp_path / name, kind, random_surfels(count=20), **options)
+    found = format_of(path, read_scene(path))
+    assert (found.exporter, found.options, found.note) == (kind, options, "")
+    assert len(read_back(write(tmp_path / f"again.{name}", found.exporter, random_surfels(), **found.options))) == 7
+
+
+def test_what_is_not_written_becomes_a_ply_and_is_said(tmp_path):
+    (tmp_path / "a.splat").write_bytes(bytes(24) + bytes([1] * 8))
+    found = format_of(tmp_path / "a.splat", read_scene(tmp_path / "a.splat"))
+    assert found.exporter == "ply" and found.note == "A .splat is not written, so a .ply of 3DGS is."
+
+
+def test_changes_are_counted_by_nearest_neighbours():
+    before, _ = discs()
+    moved = before.means.clone()
+    moved[0] += 0.001
+    moved[1] += 3.0  # far away: nobody's neighbour but still the same one, as no other is nearer to it
+    halves = before[2:3]
+    after = joined(replace(before, means=moved)[torch.arange(75) != 5], replace(halves, means=halves.means + 0.01))
+    found = changes(before, after)
+    assert (found.before, found.after, found.new, found.gone) == (75, 75, 75 - found.kept, 75 - found.kept)
+    assert found.kept in (73, 74) and found.moved <= 1 and found.median == 0
+    assert "75 Gaussians became 75" in str(found)
+    assert changes(before[:0], after).new == 75 and changes(before, after[:0]).gone == 75
