@@ -6,6 +6,7 @@ photos show is emitted (UsdPreviewSurface has no unlit material).
 
 from __future__ import annotations
 
+import os
 import tempfile
 from dataclasses import dataclass
 from importlib import import_module
@@ -25,6 +26,7 @@ from beags_plugin.export.texture import Texture
 from beags_plugin.extraction.files import whole_file
 
 _PICTURE = "colors.png"
+_LONG_AGO = 631152000  # 1990, in seconds since 1970; a package cannot say less than 1980
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,8 @@ def packed(layer: Path) -> bytes:
     """Return the content of a .usdz of a layer and the files beside it that it names."""
     Sdf, UsdUtils = modules("Sdf", "UsdUtils")
     package = layer.with_suffix(".usdz")
+    for file in layer.parent.iterdir():
+        os.utime(file, (_LONG_AGO, _LONG_AGO))  # a package keeps times: the same bytes at any
     if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(layer)), str(package)):
         raise RuntimeError("Pixar's USD library packed nothing")
     return package.read_bytes()

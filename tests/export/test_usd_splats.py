@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -92,6 +93,14 @@ def test_places_scales_and_colours_are_read_back_by_pixars_library(tmp_path):
     assert np.allclose(coefficients, surfels.sh, atol=1e-6)
     low, high = np.array(field.GetExtentAttr().Get())
     assert (low < surfels.means.numpy()).all() and (high > surfels.means.numpy()).all()
+
+
+@KINDS
+def test_the_same_bytes_again(tmp_path, kind):
+    """A package keeps the times of its files."""
+    first = write(tmp_path / f"a.{kind[:4]}", kind, random_surfels()).read_bytes()
+    time.sleep(2.1)  # the times of a package count every second one
+    assert write(tmp_path / f"b.{kind[:4]}", kind, random_surfels()).read_bytes() == first
 
 
 def test_y_up_turns_places_rotations_and_colours(tmp_path):
