@@ -226,7 +226,7 @@ class Clean:
     """The splat file: .ply, .spz, .sog, .splat, .glb, .usdz and others (docs/export.md), or a run of splatfacto."""
     data: Path
     """Folder of the photos, with the poses in whose world the scene lies, and id masks."""
-    objects: tuple[str, ...] = ()
+    object: tuple[str, ...] = ()
     """Names of objects that get a file of their own too."""
     output: Path | None = None
     """Folder for the files, the report and the run; outputs/<scene>_cleaned if left out."""
@@ -238,7 +238,7 @@ class Clean:
     def run(self) -> None:
         with starting(self):
             from beags_plugin.commands.clean import clean_scene
-        clean_scene(self.scene, self.data, self.objects, self.output, self.polish, self.steps)
+        clean_scene(self.scene, self.data, self.object, self.output, self.polish, self.steps)
 
 
 @dataclass

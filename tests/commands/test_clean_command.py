@@ -25,7 +25,7 @@ def test_a_scene_is_refined_and_written_back_in_its_format(tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     scene = write_start_scene(tmp_path / "data")
     write(tmp_path / "my scene.spz", "spz", scene.surfels)
-    arguments = ["clean", "my scene.spz", "--data", "data", "--polish", "1", "--steps", "2", "--objects"]
+    arguments = ["clean", "my scene.spz", "--data", "data", "--polish", "1", "--steps", "2", "--object"]
     with pytest.raises(SystemExit):
         main([*arguments, "cup"])
     assert "there is no object 'cup'" in capsys.readouterr().out and not Path("outputs/my scene_cleaned/run").exists()
