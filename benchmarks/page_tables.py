@@ -32,6 +32,7 @@ SPILL: Figure = ("extracted_spill_after", 1, 100.0)
 RENDERED: Figure = ("rendered_biou_after", 1, 100.0)
 FITTED: Figure = ("psnr_fit_after", 2, 1.0)
 SECONDS: Figure = ("cpu_seconds", 0, 1.0)
+ALL_SECONDS: Figure = ("cpu_seconds total", 0, 1.0)
 BEAR, DIGGER = "bear, salient", "kitchen, salient"
 
 
@@ -78,6 +79,37 @@ TABLES: tuple[PageTable, ...] = (
             "the paper's losses",
         ),
         (IOU, BIOU, SPILL, RENDERED, FITTED, SECONDS),
+    ),
+    PageTable(
+        "docs/results.md",
+        "trade-off",
+        {"digger, 260 pixels": ("trade-off-kitchen", DIGGER)},
+        (
+            "200 steps (beags-fast)",
+            "50 steps",
+            "800 steps",
+            "k / 8",
+            "k x 8",
+            "Z = 5",
+            "Z = 100",
+            "no reprojection",
+        ),
+        (BIOU, SPILL, FITTED, SECONDS),
+    ),
+    PageTable(
+        "docs/results.md",
+        "bases",
+        {"digger, 260 pixels": ("trade-off-kitchen", DIGGER)},
+        (
+            "200 steps (beags-fast)",
+            "base: no wider limits far away",
+            "base: free space not cleared",
+            "base: large Gaussians go",
+            "base: colours decay",
+            "base: no normal consistency",
+            "base: with distortion",
+        ),
+        (BIOU, RENDERED, FITTED, ALL_SECONDS),
     ),
     PageTable(
         "docs/comparison.md",

@@ -16,12 +16,14 @@ import torch
 from torch import Tensor
 
 from beags_plugin.extraction.files import whole_file
+from beags_plugin.extraction.ply import DISC_COMMENT
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.ply import read_vertices, write_vertices
 from beags_plugin.system.reading.text import load_json, reason
 
 FAR = 16.0
 """Distance of a run's middle from 0, in the reach of its cameras, from which single precision does not do."""
+_HEADER = 4096  # bytes, in which comments of a .ply of ours stand
 ORIGIN_FILE = "origin.json"
 """{"origin": [x, y, z], "files": [names]}: the point of the input's world that is 0 in these files beside it."""
 
@@ -58,6 +60,8 @@ def to_world(path: Path, origin: Tensor) -> bool:
     if not name.endswith(".ply"):
         return False
     table = read_vertices(path)
+    with path.open("rb") as file:
+        comment = DISC_COMMENT if DISC_COMMENT.encode() in file.read(_HEADER) else ""
     names = table.dtype.names or ()
     if not all(axis in names for axis in "xyz"):
         return False
@@ -69,7 +73,7 @@ def to_world(path: Path, origin: Tensor) -> bool:
         moved[axis] += value
     del table  # it may be a view of the file
     with whole_file(path) as part, open(part, "wb") as file:
-        write_vertices(file, moved)
+        write_vertices(file, moved, comment)
     return True
 
 

@@ -18,6 +18,7 @@ from beags_plugin.core.flattening import Gaussians
 from beags_plugin.core.sh import MAX_DEGREE, num_sh_bases
 from beags_plugin.extraction.frames import turned_gaussians
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.stand_ins import stand_in
 from beags_plugin.system.reading.text import reason
 
 _DAMAGED = (ValueError, LookupError, TypeError, OverflowError, EOFError, MemoryError, struct.error, zlib.error)
@@ -33,7 +34,8 @@ def reading(path: Path, kind: str) -> Iterator[None]:
     except (*_DAMAGED, OSError, zipfile.BadZipFile, NotImplementedError) as error:
         if isinstance(error, OSError) and error.errno is not None:  # bare ones of libraries are of the content
             raise UserError(f"{path} cannot be read ({reason(error)}): name an existing {kind} file.") from error
-        raise UserError(f"{path} is no {kind} file, or damaged ({reason(error)}): get it again.") from error
+        cause = stand_in(path) or reason(error)
+        raise UserError(f"{path} is no {kind} file, or damaged ({cause}): get it again.") from error
 
 
 def tensor(values: np.ndarray) -> Tensor:

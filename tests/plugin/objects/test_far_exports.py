@@ -52,6 +52,7 @@ def test_whole_splats_are_in_map_coordinates_in_double(far, tmp_path):
         assert table.dtype["x"] == np.float64 and table.dtype["opacity"] == np.float32
         found = np.stack([table[axis] for axis in "xyz"], axis=1)
         np.testing.assert_allclose(found, in_map(far), atol=1e-5, rtol=0)
+    assert b"SplatRenderMode: 2dgs" in (tmp_path / "whole_scene.2dgs.ply").read_bytes()[:1000]
     assert len(said) == 1 and "double precision" in said[0] and "--frame object" in said[0]
     assert not (tmp_path / "origin.json").exists()
 
