@@ -34,8 +34,9 @@ def reading(path: Path, kind: str) -> Iterator[None]:
     except (*_DAMAGED, OSError, zipfile.BadZipFile, NotImplementedError) as error:
         if isinstance(error, OSError) and error.errno is not None:  # bare ones of libraries are of the content
             raise UserError(f"{path} cannot be read ({reason(error)}): name an existing {kind} file.") from error
-        cause = stand_in(path) or reason(error)
-        raise UserError(f"{path} is no {kind} file, or damaged ({cause}): get it again.") from error
+        if (cause := stand_in(path)) is not None:
+            raise UserError(f"{path} is no {kind} file ({cause}).") from error
+        raise UserError(f"{path} is no {kind} file, or damaged ({reason(error)}): get it again.") from error
 
 
 def tensor(values: np.ndarray) -> Tensor:

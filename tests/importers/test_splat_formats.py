@@ -295,13 +295,14 @@ def cut(path: Path) -> bytes:
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("a.spz", b"", "is no .spz file, or damaged"),
+        ("a.spz", b"", "is no .spz file (it is empty"),
         ("a.spz", gzip.compress(b"nothing of the kind at all"), "that of something else"),
         ("a.spz", bomb(3), "4000000000 Gaussians, which do not fit"),
         ("a.spz", bomb(4), "4000000000 Gaussians, which do not fit"),
         ("a.spz", gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 1, 1, 0, 12, 0, 0) + bytes(20)), "version is 1"),
         ("a.splat", bytes(33), "33 bytes, which are no whole rows of 32"),
-        ("a.splat", b"", "has 0 bytes"),
+        ("a.splat", b"", "is no .splat file (it is empty"),
+        ("a.sog", b"version https://git-lfs.github.com/spec/v1\n", "run git lfs pull"),
         ("a.sog", b"PK\x03\x04 nothing", "is no .sog file, or damaged"),
         ("meta.json", b'{"version": 1}', "its version is 1"),
         (
