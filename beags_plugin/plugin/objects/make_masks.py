@@ -78,11 +78,11 @@ class RunGeometry:
 
     def to_straight(self, labels: np.ndarray, view: int) -> np.ndarray:
         split, index = self._of_split[view]
-        return self.manager.undistorted(labels, index, split)
+        return self.manager.files[split].undistorted(labels, index)
 
     def to_photo(self, labels: np.ndarray, view: int) -> np.ndarray:
         split, index = self._of_split[view]
-        return self.manager.as_in_file(labels, index, split=split)
+        return self.manager.files[split].as_in_file(labels, index)
 
 
 def configured_source(name: str, options: Sequence[str]) -> MaskSource:

@@ -113,7 +113,7 @@ def _pixel(point: PhotoPoint, manager: BeagsDataManager) -> tuple[Camera, float,
     if not (-0.5 <= point.x < width - 0.5 and -0.5 <= point.y < height - 0.5):
         raise UserError(f"{point.view} has {width} x {height} pixels: {point.x:g},{point.y:g} is not one.")
     share = torch.tensor([(point.x + 0.5) / width, (point.y + 0.5) / height], dtype=torch.float64)
-    camera, straight = manager.straightened(share.numpy()[None], index, split)
+    camera, straight = manager.files[split].straightened(share.numpy()[None], index)
     x, y = straight[0].tolist()
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         raise UserError(

@@ -160,8 +160,9 @@ def write_reprojection(found: ReprojectedRun, output: Path, min_confidence: floa
             final = np.where(doubtful, np.uint16(IGNORE), voted)
             for folder in ("masks", "confidence"):
                 (output / folder / path).parent.mkdir(parents=True, exist_ok=True)
-            write_mask(output / "masks" / path, found.manager.as_in_file(final, index))
-            Image.fromarray(found.manager.as_in_file(confidence, index, border=0)).save(output / "confidence" / path)
+            files = found.manager.files["train"]
+            write_mask(output / "masks" / path, files.as_in_file(final, index))
+            Image.fromarray(files.as_in_file(confidence, index, border=0)).save(output / "confidence" / path)
             changes.append(_change(found, index, doubtful))
         (output / "classes.json").write_text(json.dumps({str(i): name for i, name in found.classes.items()}, indent=1))
         report = {"method": found.method, "seconds": found.seconds, "min_confidence": min_confidence, "views": changes}

@@ -74,7 +74,7 @@ def write_underlays(
             picture = drawn.color.cpu() + (1.0 - drawn.alpha.cpu())[..., None] * faded
             straight = (255.0 * picture.clamp(0, 1) + 0.5).to(torch.uint8).numpy()
             as_photo = np.stack(
-                [manager.as_in_file(straight[..., c], index, border=0, split="eval") for c in range(3)], axis=2
+                [manager.files["eval"].as_in_file(straight[..., c], index, border=0) for c in range(3)], axis=2
             )
             _save(folder / _folder_of(name) / path, as_photo)
             if progress is not None:

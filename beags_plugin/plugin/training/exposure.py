@@ -143,7 +143,7 @@ def photo_gains(datamanager: BeagsDataManager) -> Gains | None:
             held = view.data()
             image = in_unit_range(held["image"]).cpu()
             ids, shares = tracks[index]
-            xy = datamanager.straightened(shares, index, "train")[1]
+            xy = datamanager.files["train"].straightened(shares, index)[1]
             inside = ((xy >= 0) & (xy < image.shape[1::-1])).all(axis=1)  # Without its lens a photo shows less.
             inside[inside] = _shown(view, held, datamanager)[tuple(xy[inside].astype(np.int64).T[::-1])]
             places.append(np.where(inside, ids, -1))

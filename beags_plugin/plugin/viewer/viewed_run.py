@@ -42,7 +42,7 @@ class ViewedRun:
         cameras = dataset.cameras
         self.cameras: list[Camera] = [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
         self.grid: VisibilityGrid | None = None
-        self._before = lru_cache(_KEPT_MASKS)(datamanager.mask_labels)
+        self._before = lru_cache(_KEPT_MASKS)(datamanager.files["train"].mask_labels)
         self.refining: Callable[[], bool] = lambda: True  # see ``prepared``
         self._after = lru_cache(_KEPT_MASKS)(_read_mask)
         self._kept = digest_of_prepared(folder) if (folder / EXTRACTION_FILE).exists() else None

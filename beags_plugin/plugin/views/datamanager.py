@@ -6,10 +6,8 @@ import os
 import random
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -24,12 +22,12 @@ from tyro.conf import Suppress
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.labels.label_maps import CompressedMap, to_compact, to_int32
-from beags_plugin.plugin.views import lens
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio, resize_cameras
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig, absolute
 from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.plugin.views.dense_seeds import MOST_PHOTOS, with_dense_seeds
 from beags_plugin.plugin.views.objects_alone import objects_alone
+from beags_plugin.plugin.views.photo_files import PhotoFiles
 from beags_plugin.plugin.views.small_views import SizeAt, SmallViews
 from beags_plugin.plugin.views.streaming import Lazy, StreamedViews
 from beags_plugin.plugin.views.views import View, unique_names
@@ -80,10 +78,9 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
 
     def __init__(self, config: BeagsDataManagerConfig, *args, **kwargs) -> None:
         super().__init__(config, *args, **kwargs)
-        datasets = {"train": self.train_dataset, "eval": self.eval_dataset}
-        self._distorted = {split: deepcopy(dataset.cameras) for split, dataset in datasets.items()}
-        for dataset in datasets.values():
-            lens.straighten(dataset.cameras)
+        self.files: dict[Split, PhotoFiles] = {
+            "train": PhotoFiles(self.train_dataset), "eval": PhotoFiles(self.eval_dataset)
+        }  # fmt: skip
         self.train_cameras = self.train_dataset.cameras.to(self.device)
         self._cameras: dict[int, Camera] = {}
         self._small = SmallViews(keep=not isinstance(self.cached_train, StreamedViews))
@@ -103,7 +100,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     def _load_images(self, split: Split, cache_images_device: Literal["cpu", "gpu"]) -> Any:
         """Return the data of all views, in memory or streamed."""
         dataset = self._dataset(split)
-        load = partial(self._load_view, split)
+        load = partial(self.files[split].load, image_type=self.config.cache_images_type)
         if self.streams(split):
             say(f"{len(dataset)} {split} images would take {self._cache_gb(split):.1f} GB: they are read when needed.")
             workers = self.config.max_thread_workers or min(4, os.cpu_count() or 1)
@@ -131,59 +128,6 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
 
     def _dataset(self, split: Split) -> BeagsDataset:
         return self.train_dataset if split == "train" else self.eval_dataset
-
-    def _lens(self, split: Split, index: int) -> tuple[Cameras, Cameras, int]:
-        """Return what the functions of ``lens`` ask for: cameras before and after undistortion, and which of them."""
-        return self._distorted[split], self._dataset(split).cameras, index
-
-    def _load_view(self, split: Split, index: int) -> dict[str, Any]:
-        """Read image, labels and alpha of one view from its files, without lens distortion."""
-        dataset, cameras = self._dataset(split), self._lens(split, index)
-        data = dataset.get_data(index, image_type=self.config.cache_images_type)
-        if lens.has_lens(cameras[0], index):
-            data["image"] = torch.from_numpy(lens.undistort_image(data["image"].numpy(), cameras[0], index))
-        labels = lens.undistort_labels(data["labels"].numpy(), *cameras)
-        assert labels.shape == data["image"].shape[:2], "labels and image differ in size"
-        data["labels"] = to_compact(torch.from_numpy(labels.astype(np.int32)))
-        if (alpha := dataset.get_alpha(index)) is not None:
-            data["alpha"] = torch.from_numpy(lens.undistort_alpha(alpha, *cameras))
-        return data
-
-    def mask_labels(self, index: int, split: Split = "train") -> np.ndarray | None:
-        """Read the labels [H, W] uint16 in the mask file of a view, undistorted; None without a file."""
-        dataset = self._dataset(split)
-        if dataset.metadata["mask_filenames"][index] is None:
-            return None
-        return self.undistorted(dataset.get_metadata({"image_idx": index})["labels"].numpy(), index, split)
-
-    def undistorted(self, labels: np.ndarray, index: int, split: Split = "train") -> np.ndarray:
-        """Remove a view's lens distortion from labels [h, w] of any size."""
-        return lens.undistort_labels(labels, *self._lens(split, index))
-
-    def straightened(self, places: np.ndarray, index: int, split: Split) -> tuple[Camera, np.ndarray]:
-        """Return a view's camera without lens, and where places of its photo are in it, [P, 2] (centres at + 0.5).
-
-        places: [P, 2] float64, in shares of the photo's width and height.
-        """
-        distorted, straight, _ = self._lens(split, index)
-        points = places * [int(distorted.width[index]), int(distorted.height[index])]
-        return camera_from_nerfstudio(straight, index), lens.straight_points(points, distorted, straight, index)
-
-    def picture(self, file: Path, index: int, split: Split = "train") -> Tensor:
-        """Read another picture of a view as its photo [H, W, 3] float in 0..1, undistorted."""
-        image = self._dataset(split).get_numpy_image(index, file)
-        cameras = self._distorted[split]
-        if lens.has_lens(cameras, index):
-            image = lens.undistort_image(image, cameras, index)
-        return torch.from_numpy(image).float() / 255.0
-
-    def as_in_file(self, labels: np.ndarray, index: int, border: int = IGNORE, split: Split = "train") -> np.ndarray:
-        """Put the lens distortion of a view's file back into labels [h', w'], at the size the file was read at.
-
-        border: what is where the straight view does not reach.
-        """
-        width, height = self._dataset(split).file_sizes[index]
-        return lens.redistort_labels(labels, *self._lens(split, index), (height, width), border)
 
     # -- batches -----------------------------------------------------------------------------------------------------
 
@@ -310,7 +254,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     def _labels(self, split: Split, index: int, original: bool) -> Tensor | None:
         """Return a view's labels [H, W] int32 without reading its photo; None without a mask."""
         if split == "eval" or original or self._present is None:
-            mask = self.mask_labels(index, split)
+            mask = self.files[split].mask_labels(index)
             return None if mask is None else torch.from_numpy(mask.astype(np.int32)).to(self.device)
         cache = self.cached_train
         labels = cache.labels[index].unpacked() if isinstance(cache, StreamedViews) else cache[index]["labels"]

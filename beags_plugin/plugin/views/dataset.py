@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -43,37 +44,44 @@ class BeagsDataset(InputDataset):
     def get_numpy_image(self, image_idx: int, path: Path | None = None) -> np.ndarray:
         """Read the image [H, W, 3] uint8, sRGB, before undistortion; path: of another picture of the same view."""
         path = path or self._dataparser_outputs.image_filenames[image_idx]
-
-        def read(image: Image.Image) -> np.ndarray:
-            if image.mode.startswith(("I", "F")):
-                raise UserError(f"the image {path} has more than 8 bits per channel: convert it to 8 bits.")
-            if image.has_transparency_data:
-                image = image.convert("RGBA")
-                image = Image.alpha_composite(Image.new("RGBA", image.size, (0, 0, 0, 255)), image)
-            return np.array(image.convert("RGB"))
-
-        return resize_area(read_image(path, read), *self.file_sizes[image_idx])
+        return resize_area(read_image(path, partial(_colors, path)), *self.file_sizes[image_idx])
 
     def get_alpha(self, image_idx: int) -> np.ndarray | None:
         """Read the image's alpha [H, W] uint8, before undistortion; None if it is opaque everywhere."""
+        alpha = read_image(self._dataparser_outputs.image_filenames[image_idx], _alpha)
+        return None if alpha is None else resize_area(alpha, *self.file_sizes[image_idx])
 
-        def read(image: Image.Image) -> np.ndarray | None:
-            return np.array(image.convert("RGBA").getchannel("A")) if image.has_transparency_data else None
-
-        alpha = read_image(self._dataparser_outputs.image_filenames[image_idx], read)
-        return None if alpha is None or (alpha == 255).all() else resize_area(alpha, *self.file_sizes[image_idx])
+    def get_full_image(self, image_idx: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """Read image and alpha as the other two do, at the size of the file, which is decoded once."""
+        path = self._dataparser_outputs.image_filenames[image_idx]
+        return read_image(path, lambda image: (_colors(path, image), _alpha(image)))
 
     def get_metadata(self, data: dict) -> dict:
         """Read the labels of view ``data["image_idx"]``, before undistortion."""
         index = data["image_idx"]
-        width, height = self.file_sizes[index]
-        path = self.metadata["mask_filenames"][index]
+        return {"labels": torch.from_numpy(self.get_labels(index, *self.file_sizes[index]))}
+
+    def get_labels(self, image_idx: int, width: int, height: int) -> np.ndarray:
+        """Read the labels [height, width] uint16 of a view, before undistortion."""
+        path = self.metadata["mask_filenames"][image_idx]
         if path is None:
-            labels = np.full((height, width), IGNORE, np.uint16)
-        else:
-            ids = read_mask(path, self.metadata["mask_kind"], self.metadata["ignore_ids"])
-            labels = resize_nearest(ids, height, width)
-        return {"labels": torch.from_numpy(labels)}
+            return np.full((height, width), IGNORE, np.uint16)
+        ids = read_mask(path, self.metadata["mask_kind"], self.metadata["ignore_ids"])
+        return resize_nearest(ids, height, width)
+
+
+def _colors(path: Path, image: Image.Image) -> np.ndarray:
+    if image.mode.startswith(("I", "F")):
+        raise UserError(f"the image {path} has more than 8 bits per channel: convert it to 8 bits.")
+    if image.has_transparency_data:
+        image = image.convert("RGBA")
+        image = Image.alpha_composite(Image.new("RGBA", image.size, (0, 0, 0, 255)), image)
+    return np.array(image.convert("RGB"))
+
+
+def _alpha(image: Image.Image) -> np.ndarray | None:
+    alpha = np.array(image.convert("RGBA").getchannel("A")) if image.has_transparency_data else None
+    return None if alpha is None or (alpha == 255).all() else alpha
 
 
 def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -125,12 +125,12 @@ class HeldOutViews(Sequence[EvalView]):
     def _picture(self, file: Path, view: int) -> Tensor:
         """Read a picture [H, W, 3] without an object, as the photograph is read."""
         self._check_proportions("picture", file, image_size(file), view)
-        return self.manager.picture(file, view, "eval")
+        return self.manager.files["eval"].picture(file, view)
 
     def _straight(self, file: Path, ids: np.ndarray, view: int) -> np.ndarray:
         """Undistort ids; raises ``UserError`` if they have other proportions than the photograph."""
         self._check_proportions("mask", file, (ids.shape[1], ids.shape[0]), view)
-        return self.manager.undistorted(ids, view, "eval")
+        return self.manager.files["eval"].undistorted(ids, view)
 
     def _check_proportions(self, what: str, file: Path, size: tuple[int, int], view: int) -> None:
         """Raise ``UserError`` if a file of width and height ``size`` has other proportions than the photograph."""

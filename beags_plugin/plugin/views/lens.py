@@ -58,6 +58,32 @@ def undistort_alpha(alpha: np.ndarray, distorted: Cameras, straight: Cameras, in
     return alpha if maps is None else cv2.remap(alpha, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
 
+def straight_size(distorted: Cameras, straight: Cameras, index: int, shape: tuple[int, ...]) -> tuple[int, int]:
+    """Return width and height of the straight image at the scale at which the distorted one is of ``shape`` [h, w]."""
+    height, width = shape
+    return (
+        max(1, round(int(straight.width[index]) * width / int(distorted.width[index]))),
+        max(1, round(int(straight.height[index]) * height / int(distorted.height[index]))),
+    )
+
+
+def undistort_region(
+    image: np.ndarray, distorted: Cameras, straight: Cameras, index: int, box: tuple[int, int, int, int],
+    interpolation: int, border: int,
+) -> np.ndarray:  # fmt: skip
+    """Return a region of a straight image, of which memory does not grow with the rest.
+
+    image: [h, w] or [h, w, C], the whole distorted image at any size. box: left, top, right and bottom in the straight
+    image at the same scale. border: what is outside the lens.
+    """
+    left, top, right, bottom = box
+    if not has_lens(distorted, index):
+        return np.ascontiguousarray(image[top:bottom, left:right])
+    maps = _maps_of_region(distorted, straight, index, image.shape[:2], box)
+    borders = (border,) * (image.shape[2] if image.ndim == 3 else 1)
+    return cv2.remap(image, *maps, interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=borders)
+
+
 def redistort_labels(
     labels: np.ndarray, distorted: Cameras, straight: Cameras, index: int, shape: tuple[int, int], border: int
 ) -> np.ndarray:
@@ -117,15 +143,22 @@ def _lens_maps(
     without distortion."""
     if not has_lens(distorted, index):
         return None
+    new_size = straight_size(distorted, straight, index, shape)
+    return _maps_of_region(distorted, straight, index, shape, (0, 0, *new_size))
+
+
+def _maps_of_region(
+    distorted: Cameras, straight: Cameras, index: int, shape: tuple[int, ...], box: tuple[int, int, int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``_lens_maps`` within left, top, right and bottom of the straight image at the scale of ``shape``."""
     height, width = shape
-    new_size = (
-        max(1, round(int(straight.width[index]) * width / int(distorted.width[index]))),
-        max(1, round(int(straight.height[index]) * height / int(distorted.height[index]))),
-    )
+    left, top, right, bottom = box
+    new_size = straight_size(distorted, straight, index, shape)
     K, new_K = _intrinsics(distorted, index, width, height), _intrinsics(straight, index, *new_size)
+    new_K[:2, 2] -= (left, top)
     fisheye, lens = _opencv_lens(distorted, index)
     make = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
-    return make(K, lens, np.eye(3), new_K, new_size, cv2.CV_32FC1)
+    return make(K, lens, np.eye(3), new_K, (right - left, bottom - top), cv2.CV_32FC1)
 
 
 def _opencv_lens(cameras: Cameras, index: int) -> tuple[bool, np.ndarray]:

@@ -17,7 +17,7 @@ def test_a_class_map_comes_back_to_its_photo(tmp_path, model):
     data = manager(tmp_path)
     row, column = np.mgrid[:LARGE_H, :LARGE_W]
     given = (1 + row // 20 * 8 + column // 20).astype(np.uint16)  # squares: their borders tell any shift
-    back = data.as_in_file(data.undistorted(given, 0), 0)
+    back = data.files["train"].as_in_file(data.files["train"].undistorted(given, 0), 0)
     known = back != IGNORE
     assert back.shape == given.shape and known.mean() > 0.7
     inner = known & (row % 20 > 1) & (row % 20 < 18) & (column % 20 > 1) & (column % 20 < 18)
