@@ -65,6 +65,16 @@ class Camera:
         return moved
 
 
+def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
+    """Return the camera of a region of its image: the same, with the principal point shifted.
+
+    left, top: of the region, pixels. width, height: of the region.
+    """
+    host = camera.host
+    shift = host.K.new_tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+    return Camera(host.viewmat, host.K - shift, width, height).to(camera.viewmat.device)
+
+
 def viewmat_from_opengl(camera_to_world: Tensor) -> Tensor:
     """Return the world-to-camera matrix, OpenCV axes, of a camera-to-world matrix, OpenGL axes (nerfstudio's).
 

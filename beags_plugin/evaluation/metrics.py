@@ -15,6 +15,7 @@ from beags_plugin.labels.class_ids import resize_nearest
 
 AGREEMENT = ("acc", "iou", "biou")
 METRICS = (*AGREEMENT, "spill")
+CLOSE_UP_METRICS = ("psnr", "ssim", "iou", "biou", "spill")
 REMOVAL_METRICS = ("psnr", "psnr_shown", "shown", "ssim", "remains")
 
 
@@ -47,6 +48,21 @@ class RemovalMetrics:
     shown: float | None
     ssim: float | None
     remains: float | None
+
+
+@dataclass(frozen=True)
+class CloseUpMetrics:
+    """An object at the size of the photo's file, within its box, or a mean of that; see ``close_up``.
+
+    psnr, ssim: of the whole scene, over the visible object, dB and at most 1. iou, biou, spill: of the object drawn
+    alone, as in ``MaskMetrics``. None as there.
+    """
+
+    psnr: float | None
+    ssim: float | None
+    iou: float | None
+    biou: float | None
+    spill: float | None
 
 
 def _array(image: Any) -> np.ndarray:
@@ -89,12 +105,15 @@ def compared_masks(
     return np.where(counted, predicted, true), true, counted
 
 
-def mask_metrics(prediction: Any, truth: Any, ignore: Any = None, protocol: Protocol | None = None) -> MaskMetrics:
+def mask_metrics(
+    prediction: Any, truth: Any, ignore: Any = None, protocol: Protocol | None = None, band: int | None = None
+) -> MaskMetrics:
     """Return Acc, IoU, BIoU and spill of a mask (method, section 8).
 
     prediction: [H', W'] bool array or tensor. truth: [H, W] bool. ignore: [H, W] bool or None; True pixels count
-    nowhere. A mask that is empty in truth and prediction is not scored: all are None. Raises ``ValueError`` for
-    masks that are not two-dimensional and for an ``ignore`` of another size than the truth.
+    nowhere. band: width of the boundary band, pixels, if not the protocol's share of the masks' diagonal.
+    A mask that is empty in truth and prediction is not scored: all are None. Raises ``ValueError`` for masks that are
+    not two-dimensional and for an ``ignore`` of another size than the truth.
     """
     protocol = protocol or Protocol()
     predicted, true, counted = compared_masks(prediction, truth, ignore, protocol)
@@ -105,7 +124,7 @@ def mask_metrics(prediction: Any, truth: Any, ignore: Any = None, protocol: Prot
 
     if not ((predicted | true) & counted).any():
         return MaskMetrics(None, None, None, None)
-    d = band_width(true.shape[0], true.shape[1], protocol.band_share)
+    d = band_width(true.shape[0], true.shape[1], protocol.band_share) if band is None else band
     return MaskMetrics(
         acc=np.count_nonzero((predicted == true) & counted) / np.count_nonzero(counted),
         iou=iou(predicted, true),

@@ -2,34 +2,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.evaluation.metrics import AGREEMENT, METRICS, REMOVAL_METRICS, MaskMetrics, RemovalMetrics
+from beags_plugin.evaluation.metrics import (
+    AGREEMENT,
+    CLOSE_UP_METRICS,
+    METRICS,
+    REMOVAL_METRICS,
+    CloseUpMetrics,
+    MaskMetrics,
+    RemovalMetrics,
+)
 
 MaskKind = Literal["extracted", "seen", "rendered"]
 MASK_KINDS: tuple[MaskKind, ...] = ("extracted", "seen", "rendered")
 """extracted: the object rendered alone. seen: the same over the parts that training photos show, where the data says
 which. rendered: the object's share of the whole scene."""
-Kind = MaskKind | Literal["removal"]
+Kind = MaskKind | Literal["removal", "close_up"]
 FIGURES: dict[Kind, tuple[str, ...]] = {
     "extracted": METRICS,
     "seen": METRICS,
     "rendered": (*AGREEMENT, "covered"),
     "removal": REMOVAL_METRICS,
+    "close_up": CLOSE_UP_METRICS,
 }
 """The names of the figures of each kind. Spill is of objects drawn alone, covered of the whole scene. removal: the
-scene rendered without the object, where the data has an exact picture of that."""
+scene rendered without the object, where the data has an exact picture of that. close_up: the object at the size of the
+photo's file, where that is larger than what is trained on."""
 KINDS = tuple(FIGURES)
 IMAGE_FIGURES = ("psnr", "psnr_fit", "psnr_shown", "shown", "psnr_objects", "ssim")
 """Of whole images. psnr_fit: after the affine map of colours that fits the photo best, one a photo, clamped to 0..1.
 psnr_shown: over the pixels whose surface some training photo shows; shown: their share.
 psnr_objects: over the pixels of any object but those next to the background. These two are taken after that map where
 ``SceneMetrics.colors_fitted`` says so."""
+
+
+@dataclass(frozen=True)
+class FullPhoto:
+    """A photo at the size of its file. camera: of all of it.
+
+    region: reads left, top, right and bottom, pixels; returns its camera and [h, w, 3] float in 0..1.
+    """
+
+    camera: Camera
+    region: Callable[[tuple[int, int, int, int]], tuple[Camera, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -44,7 +65,8 @@ class EvalView:
     object id to [H, W, 3] float in 0..1, the exact picture without it. removed_shown: object id to [h, w] bool, the
     part of the silhouette where that picture shows surface which some training photo shows. unknown_silhouettes,
     unknown_visible: object id to [h, w] bool, the pixels of which cannot be told whether its silhouette, or its mask in
-    ``visible_objects``, holds them; they are in neither and count nowhere.
+    ``visible_objects``, holds them; they are in neither and count nowhere. full: the photograph at the size of its
+    file, where that is larger.
     """
 
     camera: Camera
@@ -58,6 +80,7 @@ class EvalView:
     removed_shown: Mapping[int, Tensor] | None = None
     unknown_silhouettes: Mapping[int, Tensor] | None = None
     unknown_visible: Mapping[int, Tensor] | None = None
+    full: FullPhoto | None = None
 
 
 @dataclass(frozen=True)
@@ -68,6 +91,7 @@ class ObjectMetrics:
     rendered: MaskMetrics | None
     seen: MaskMetrics | None = None
     removal: RemovalMetrics | None = None
+    close_up: CloseUpMetrics | None = None
 
 
 @dataclass(frozen=True)
@@ -81,7 +105,7 @@ class MaskRecord:
     class_id: int
     view: int
     truth: str
-    metrics: MaskMetrics | RemovalMetrics
+    metrics: MaskMetrics | RemovalMetrics | CloseUpMetrics
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from torch import Tensor
 from beags_plugin.core.color_fit import affine_color_fit, apply_affine
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.evaluation.close_up import band_of, close_up, close_up_metrics
 from beags_plugin.evaluation.metrics import covered, mask_metrics, mean, mean_metrics, psnr
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import (
@@ -99,6 +100,16 @@ def evaluate_scene(
                     of_view = shown[index]
                     over = psnr(color[of_view], photo[of_view]) if of_view.any() else None
                     image = replace(image, psnr_shown=over, shown=float(of_view.double().mean()))
+                for class_id in objects:
+                    if not objects_alone and (part := close_up(view, class_id)) is not None:
+                        near = MaskRenderer(surfels, members, part, rasterizer, settings, protocol)
+                        mask, band = near.masks("extracted", [class_id])[class_id], band_of(view, protocol.band_share)
+                        agreement = mask_metrics(mask.prediction, mask.truth, mask.ignore, protocol, band)
+                        drawn = near.image(surfels, background)
+                        if colors_fitted:  # The fit of the whole photo, as above.
+                            drawn = fitted_colors(drawn, affine).to(drawn)
+                        metrics = close_up_metrics(part, class_id, drawn, agreement)
+                        masks.append(MaskRecord("close_up", class_id, index, mask.source, metrics))
                 for class_id, exact, silhouette, known in removals(view, [] if objects_alone else objects):
                     assert members is not None
                     rest = renderer.image(remove_class(surfels, members, class_id)[0], background)

@@ -63,6 +63,7 @@ def render_run(
         rows.append(("mean", content["mean"], None))
         parts.append(_mask_table(run.scene, "object", [*rows, *_worst(content)], stages))
         parts += _removal_table(run.scene, "object", rows, stages)
+        parts += _close_up_table(run.scene, "object", rows, stages)
     else:
         parts.append(Text(run.scene))
     lines = []
@@ -94,7 +95,8 @@ def render_data_set(found: DataSetMetrics) -> RenderableType:
     scenes.append([(found.name, content["mean"], content)])
     table = _mask_table("All scenes", "scene", [row for scene in scenes for row in scene], stages)
     removal = _removal_table("All scenes", "scene", [scene[0] for scene in scenes], stages)
-    return Group(table, *removal, Text(protocol_line(found.runs)))
+    near = _close_up_table("All scenes", "scene", [scene[0] for scene in scenes], stages)
+    return Group(table, *removal, *near, Text(protocol_line(found.runs)))
 
 
 def protocol_line(runs: Sequence[RunMetrics]) -> str:
@@ -172,6 +174,14 @@ def _removal_table(what: str, first: str, rows: Sequence[_Row], stages: Sequence
         yield _table(
             f"{what}: objects removed, PSNR in dB, pixels shown and remains in %", first, plain, stages, columns
         )
+
+
+def _close_up_table(what: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> Iterator[RenderableType]:
+    """Yield a table of objects at the size of the photos' files, if any row has that."""
+    if any(_known(rows, stages, "close_up", metric) for metric in FIGURES["close_up"]):
+        columns = [("close_up", metric) for metric in FIGURES["close_up"]]
+        plain = [(name, row, None) for name, row, _ in rows]
+        yield _table(f"{what}: objects at the photos' own size, PSNR in dB, masks in %", first, plain, stages, columns)
 
 
 def _known(rows: Sequence[_Row], stages: Sequence[Stage], kind: str, metric: str) -> bool:

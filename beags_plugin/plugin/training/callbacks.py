@@ -30,6 +30,7 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
     model.seed = trainer.config.machine.seed
     model.extent = camera_extent(datamanager.train_dataset.cameras.camera_to_worlds).to(model.device)
     shrink(model, datamanager)
+    datamanager.focus()
     densifier = Densifier(model, adam, datamanager)
     switch = RefinementSwitch(model, trainer, datamanager)
     switch.check()

@@ -28,8 +28,7 @@ class Densifier:
         self.datamanager = datamanager
         cameras = datamanager.train_dataset.cameras
         self.camera_centers = cameras.camera_to_worlds[:, :3, 3]  # [V, 3] world
-        pixels = int((cameras.height * cameras.width).sum())  # of all whole training images
-        self.config = model.config.densify.scaled(model.schedule.scale).bounded(pixels)
+        self.config = model.config.densify.scaled(model.schedule.scale).bounded(datamanager.training_pixels)
         self.adam = adam
         self.statistics = GradientStatistics(model.num_points, model.device)
         self.free = self._free_depths()

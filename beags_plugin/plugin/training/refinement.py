@@ -184,10 +184,11 @@ class RefinementSwitch:
         CONSOLE.rule("Preparing refinement")
         start = time.perf_counter()
         with self.trainer.long_stage(step):
-            views = self.datamanager.views("train", original=True)
+            whole = self.datamanager.views("train", original=True)
+            views = [*whole, *self.datamanager.close_up_views()]
             with bar("Reading masks", passing=True) as progress:
                 masks = LabelMaps(view.labels for view in counted(views, len(views), progress))
-            fit = residuals(model, views, masks) if self.datamanager.config.photos == "all" else None
+            fit = residuals(model, whole, masks[: len(whole)]) if self.datamanager.config.photos == "all" else None
             with released(self.trainer.train_lock):  # minutes, which only read the scene: a viewer may render it
                 prepared = prepare(
                     model.surfels(),
@@ -231,9 +232,10 @@ class RefinementSwitch:
         return float(self.datamanager.train_dataparser_outputs.dataparser_scale)
 
     def _start(self, grid: VisibilityGrid | None, labels: LabelMaps) -> None:
-        self.datamanager.replace_labels(labels)
+        photos = len(self.datamanager.train_dataset)
+        self.datamanager.replace_labels(labels[:photos], labels[photos:])
         self.model.grid = None if grid is None else grid.to(self.model.device)
-        own = self._own_training(self._scene(labels))
+        own = self._own_training(self._scene(labels[:photos]))
         self.model.frozen = own is None and not self.refiner.trains
         self.model.prepared = self.prepared = self.ready = True
 
@@ -290,7 +292,7 @@ class RefinementSwitch:
                 f"{folder / 'grid.pt'} has no voxels of the background, which a loss now asks about: set background of "
                 f"the occupancy loss to False, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
             )
-        views = self.datamanager.views("train")
+        views = [*self.datamanager.views("train"), *self.datamanager.close_up_views()]
         with bar("Reading masks", passing=True) as progress:
             labels = LabelMaps(
                 prepared_labels(folder / "masks" / f"{view.name}.png", view.camera).to(self.model.device)

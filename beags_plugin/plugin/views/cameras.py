@@ -40,6 +40,15 @@ def resize_cameras(cameras: Cameras, widths: Tensor, heights: Tensor) -> None:
     cameras.width, cameras.height = widths.to(torch.int64), heights.to(torch.int64)
 
 
+def take_intrinsics(cameras: Cameras, own: Camera) -> None:
+    """Give one camera of nerfstudio's, [1], the K and size of one of the method's, in place."""
+    K = own.host.K
+    for name, value in {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}.items():
+        setattr(cameras, name, torch.full_like(getattr(cameras, name), float(value)))
+    cameras.width = torch.full_like(cameras.width, own.width)
+    cameras.height = torch.full_like(cameras.height, own.height)
+
+
 def downscaled_size(sizes: Tensor, factor: float) -> Tensor:
     """Divide ``sizes``, pixels, by ``factor``: rounded, at least 1."""
     return torch.floor(sizes / factor + 0.5).clamp(min=1).to(torch.int64)

@@ -22,10 +22,12 @@ from tyro.conf import Suppress
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.labels.label_maps import CompressedMap, to_compact, to_int32
-from beags_plugin.plugin.views.cameras import camera_from_nerfstudio, resize_cameras
+from beags_plugin.plugin.views.cameras import camera_from_nerfstudio, take_intrinsics
+from beags_plugin.plugin.views.close_ups import CloseUps
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig, absolute
 from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.plugin.views.dense_seeds import MOST_PHOTOS, with_dense_seeds
+from beags_plugin.plugin.views.focus import focused
 from beags_plugin.plugin.views.objects_alone import objects_alone
 from beags_plugin.plugin.views.photo_files import PhotoFiles
 from beags_plugin.plugin.views.small_views import SizeAt, SmallViews
@@ -55,6 +57,9 @@ class BeagsDataManagerConfig(FullImageDatamanagerConfig):
     """Whether a base begins with more seed points, on whose depth several photos agree; auto: where there are at most
     50 photos, of which features give few points. It takes one or two seconds a photo."""
     begins: Suppress[bool] = False  # whether a base is to begin with seed points, which the pipeline says
+    focus: Literal["auto", "off"] | float = "auto"
+    """Share of the steps that see close-ups of objects, at up to the size of the photos' files, and not whole photos.
+    auto: half, where masks cover less than 40 % of the photos' pixels and photos are scaled down; off: none."""
     photos: Literal["all", "objects"] = "all"
     """What training sees of the photos: all, or objects, their pixels alone before a random colour (turntables)."""
 
@@ -84,10 +89,29 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         self.train_cameras = self.train_dataset.cameras.to(self.device)
         self._cameras: dict[int, Camera] = {}
         self._small = SmallViews(keep=not isinstance(self.cached_train, StreamedViews))
+        self.close_ups: CloseUps | None = None  # that training sees, once ``focus`` was called
         self._present: list[list[int]] | None = None  # objects of each training view's labels, once they are replaced
         # nerfstudio samples evaluation views by Python's global generator, which others use too.
         self._eval_order = random.Random(config.train_cameras_sampling_seed)
         self._add_dense_seeds()
+
+    def focus(self) -> None:
+        """Have training see close-ups of objects from here on, where the option ``focus`` says so."""
+        config, names = self.config, unique_names(self.train_dataset.image_filenames)
+        self.close_ups = focused(
+            config.focus,
+            self.files["train"],
+            partial(self._labels, "train", original=True),
+            names,
+            config.train_cameras_sampling_seed,
+        )
+
+    @property
+    def training_pixels(self) -> int:
+        """Pixels of all whole training photos and of their close-ups."""
+        cameras = self.train_dataset.cameras
+        whole = int((cameras.height * cameras.width).sum())
+        return whole + (0 if self.close_ups is None else self.close_ups.training_pixels)
 
     def _add_dense_seeds(self) -> None:
         """Add seed points that photos agree on, where they are wanted; there are none without points to begin with."""
@@ -142,11 +166,11 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         index = metadata["cam_idx"]
         own_camera, data = self._seen(index, data, step)
         if own_camera is not self._camera(index):
-            resize_cameras(camera, *(torch.full_like(camera.width, n) for n in (own_camera.width, own_camera.height)))
+            take_intrinsics(camera, own_camera)
         own = {"labels": data["labels"], "camera": own_camera, "objects_alone": "inside" in data}
         camera.metadata = metadata | own
         if self._present is not None:
-            data["present"] = self._present[index]
+            data.setdefault("present", self._present[index])
         return camera, data
 
     def shrink(self, size_at: SizeAt | None) -> None:
@@ -159,10 +183,18 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
 
     def _seen(self, index: int, held: dict, step: int) -> tuple[Camera, dict]:
         """Return camera and batch that ``step`` sees of a view whose data are ``held`` in the cache."""
-        camera, data = self._camera(index), self._on_device(held)
-        if self.config.photos == "objects":
-            data = objects_alone(data)
-        return self.training_camera(index, step), self._small.batch(index, camera, data, step)
+        if self.close_ups is not None and (drawn := self.close_ups.drawn(index, step)) is not None:
+            camera, data = drawn
+            present = {} if self._present is None else {"present": objects_in(to_int32(data["labels"]))}
+            data = self._as_wanted({**data, **present, "image": data["image"].to(self.device)})
+            return self._small.once(camera.to(self.device), data, step)
+        data = self._small.batch(index, self._camera(index), self._as_wanted(held), step)
+        return self.training_camera(index, step), data
+
+    def _as_wanted(self, held: dict) -> dict:
+        """Return data on the device, of all that the photo shows or of its objects."""
+        data = self._on_device(held)
+        return objects_alone(data) if self.config.photos == "objects" else data
 
     def _camera(self, index: int) -> Camera:
         """Return a training view's camera, whole, on the device; the host knows its numbers: no step fetches them."""
@@ -260,12 +292,17 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         labels = cache.labels[index].unpacked() if isinstance(cache, StreamedViews) else cache[index]["labels"]
         return to_int32(labels.to(self.device))
 
-    def replace_labels(self, labels: Sequence[Tensor]) -> None:
+    def close_up_views(self) -> list[View]:
+        """Return the close-ups that training sees, as views; none without focus."""
+        return [] if self.close_ups is None else list(self.close_ups.views(self.device))
+
+    def replace_labels(self, labels: Sequence[Tensor], of_close_ups: Sequence[Tensor] = ()) -> None:
         """Train on the labels M' of reprojected masks instead of those of the mask files (method, section 2).
 
         ``next_train`` gives those of its view [H, W] int32 to the model in ``camera.metadata["labels"]``, since the
         rasterizer, which sees no batch, renders the class boundary against them. labels: [H, W] integers of each
-        training view. Raises ``ValueError`` if their number, a size or an id (0..IGNORE) is wrong.
+        training view. of_close_ups: of each of ``close_up_views``. Raises ``ValueError`` if their number, a size or an
+        id (0..IGNORE) is wrong.
         """
         cache, cameras = self.cached_train, self.train_dataset.cameras
         if len(labels) != len(cache):
@@ -284,3 +321,5 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             for data, each in zip(cache, labels, strict=True):
                 data["labels"] = to_compact(each.detach().int()).to(data["labels"].device)
         self._present = present
+        if self.close_ups is not None:
+            self.close_ups.replace_labels(of_close_ups)

@@ -10,14 +10,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beags_plugin.core.cameras import Camera
+from beags_plugin.core.cameras import Camera, cropped
 from beags_plugin.data.files import image_size, same_proportions
 from beags_plugin.data.ground_truth import GroundTruth
-from beags_plugin.evaluation.records import EvalView
+from beags_plugin.evaluation.records import EvalView, FullPhoto
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 from beags_plugin.labels.classes import read_mask, read_object_mask
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
+from beags_plugin.plugin.views.photo_files import Box
 from beags_plugin.system.errors import UserError
 
 _NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={}, removed={}, removed_shown={})
@@ -103,7 +104,25 @@ class HeldOutViews(Sequence[EvalView]):
             self._per_object(truth["removed_shown"], index)[0] or None,
             unknown_silhouettes or None,
             unknown_visible or None,
+            self._full(index, view.camera),
         )
+
+    def _full(self, index: int, camera: Camera) -> FullPhoto | None:
+        """Return the photograph of a view at the size of its file; None where it is trained on at that size."""
+        files = self.manager.files["eval"]
+        full = files.full_camera(index)
+        if (full.width, full.height) == (camera.width, camera.height):
+            return None
+
+        def region(box: Box) -> tuple[Camera, Tensor]:
+            left, top, right, bottom = box
+            found = files.full_regions(index, [box])[0]
+            photo = found["image"].float() / 255.0
+            if "alpha" in found:
+                photo = photo + (1.0 - found["alpha"].float() / 255.0)[..., None] * self.background
+            return cropped(full, left, top, right - left, bottom - top), photo
+
+        return FullPhoto(full, region)
 
     def _per_object(
         self, files: Mapping[str, Sequence[Path | None]], view: int

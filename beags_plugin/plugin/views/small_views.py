@@ -61,6 +61,12 @@ class SmallViews:
                 self._batches[index] = kept
         return dict(kept)
 
+    def once(self, camera: Camera, batch: dict[str, Any], step: int) -> tuple[Camera, dict[str, Any]]:
+        """Return what ``step`` sees of another camera and its batch, of which nothing is kept."""
+        if (size := self._size(camera, step)) is None:
+            return camera, batch
+        return small_camera(camera, size), {name: _small(name, value, size) for name, value in batch.items()}
+
     def _size(self, camera: Camera, step: int) -> tuple[int, int] | None:
         """Return width and height of what ``step`` sees of a view with this whole camera; None for all of it."""
         if self._size_at is None:
