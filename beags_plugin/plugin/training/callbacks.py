@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, cast
 
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
@@ -20,6 +21,8 @@ from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.plugin.views.held_out_views import HeldOutViews
 
+SHARPENED = 0.5  # share of a refinement whose base has seen no close-ups
+
 
 def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
     """Build the callbacks of one run, in the order in which nerfstudio calls them."""
@@ -30,7 +33,7 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
     model.seed = trainer.config.machine.seed
     model.extent = camera_extent(datamanager.train_dataset.cameras.camera_to_worlds).to(model.device)
     shrink(model, datamanager)
-    datamanager.focus()
+    focus(model, datamanager)
     densifier = Densifier(model, adam, datamanager)
     switch = RefinementSwitch(model, trainer, datamanager)
     switch.check()
@@ -70,6 +73,13 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
         TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before),
         TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after),
     ]
+
+
+def focus(model: SceneModel, datamanager: BeagsDataManager) -> None:
+    """Begin to see close-ups of objects, and sharpen these in a refinement whose base has seen none."""
+    datamanager.focus()
+    if datamanager.close_ups is not None and model.schedule.base_steps == 0:
+        model.schedule = replace(model.schedule, sharpened=SHARPENED)
 
 
 def shrink(model: SceneModel, datamanager: BeagsDataManager) -> None:

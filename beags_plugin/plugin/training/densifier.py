@@ -11,12 +11,14 @@ from torch.optim import Adam
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import Densified, GradientStatistics, densify, length_units, reset_opacity
 from beags_plugin.core.free_space import nearest_depths, reaches_before_camera
+from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.plugin.training.scene_edits import edit_scene, move_adam_state
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system import processes
 from beags_plugin.system.progress import say
 
+SHARPEN_EVERY = 50  # steps between two rounds of growth in a refinement that sharpens
 MOST_FREED = 0.2  # share of the Gaussians; where more reach before cameras, seed points tell too little of what is near
 
 
@@ -51,8 +53,13 @@ class Densifier:
 
     def before_step(self, step: int) -> None:
         """Have the step's screen gradients computed as long as the scene still grows; a trained one does not."""
-        schedule = self.model.schedule
-        self.model.growing = not schedule.warm and step + 1 < min(self.config.stop, schedule.base_steps)
+        model, schedule = self.model, self.model.schedule
+        of_base = not schedule.warm and step + 1 < min(self.config.stop, schedule.base_steps)
+        model.growing = of_base or self._sharpens(step)
+
+    def _sharpens(self, step: int) -> bool:
+        model = self.model
+        return model.schedule.sharpening(step) and not model.frozen and model.own_training is None
 
     def after_step(self, step: int) -> None:
         """Gather statistics; densify, free the space before cameras and reset opacities when their step has come."""
@@ -60,11 +67,11 @@ class Densifier:
         growing = self.model.growing and self.model.last_render is not None
         if growing:
             self._gather()
-            if config.grows_at(done):
+            if config.grows_at(done) if step < schedule.base_steps else done % SHARPEN_EVERY == 0:
                 self._densify(done)
         if not schedule.warm and config.frees_at(done, schedule.base_steps):
             self._free_cameras()
-        if growing and config.resets_at(done):
+        if growing and step < schedule.base_steps and config.resets_at(done):
             self._reset_opacity()
 
     def _gather(self) -> None:
@@ -77,7 +84,10 @@ class Densifier:
         surfels = model.surfels().detach()
         processes.add_up([self.statistics.total, self.statistics.views])
         units = length_units(surfels.means, self.camera_centers, float(model.extent), self.config)
-        self._edit(densify(surfels, self.statistics.mean(), units, self.config, step, model.generator(step)))
+        gradient = self.statistics.mean()
+        if model.schedule.refining(step - 1):
+            gradient = torch.where(model.class_ids != BACKGROUND, gradient, 0.0)
+        self._edit(densify(surfels, gradient, units, self.config, step, model.generator(step)))
 
     def _free_cameras(self) -> None:
         """Remove the Gaussians that stand before a camera, where its photo shows what lies further off.

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -19,7 +19,6 @@ from beags_plugin.plugin.views.photo_files import Box, PhotoFiles
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
 
-Focus = Literal["auto", "off"] | float
 SHARE = 0.5
 """Share of the steps that see a close-up where nobody gives one."""
 MOST_COVERED = 0.4
@@ -46,26 +45,29 @@ class Aim:
     side: float = 0.0
 
 
-def check_focus(focus: object) -> None:
-    """Raise ``UserError`` for a share of close-ups that is none."""
-    if isinstance(focus, str) and focus in ("auto", "off"):
-        return
-    if not isinstance(focus, (int, float)) or not 0.0 <= focus <= 1.0:
-        raise UserError(
-            f"datamanager.focus is {focus}: give auto, off, or the share of steps that see objects, 0 to 1."
-        )
+def share_of(focus: str) -> float | None:
+    """Return the share of the steps that an option asks for; None for auto.
+
+    Raises ``UserError`` for what is neither auto, nor off, nor a share.
+    """
+    if focus in ("auto", "off"):
+        return None if focus == "auto" else 0.0
+    with suppress(ValueError):
+        if 0.0 <= float(focus) <= 1.0:
+            return float(focus)
+    raise UserError(f"datamanager.focus is {focus}: give auto, off, or the share of the steps with objects, 0 to 1.")
 
 
 def focused(
-    focus: Focus, files: PhotoFiles, labels: Callable[[int], Tensor | None], names: Sequence[str], seed: int
+    focus: str, files: PhotoFiles, labels: Callable[[int], Tensor | None], names: Sequence[str], seed: int
 ) -> CloseUps | None:
     """Return the close-ups that training is to see; None where it sees whole photos alone.
 
     labels: returns those of a photo [H, W] int32 at the size that is trained on, or None. names: of the photos. It says
     in a line what the objects get, or with a share given why there are no close-ups.
     """
-    check_focus(focus)
-    if focus == "off" or focus == 0.0:
+    share = share_of(focus)
+    if share == 0.0:
         return None
     cameras = files.cameras
     pixels = max(round(float((cameras.width * cameras.height).double().mean())), 1)
@@ -77,15 +79,15 @@ def focused(
     shown = [aim for aim in aims.values() if aim.boxes]
     covered = float(np.mean([aim.covered for aim in aims.values()])) if aims else 0.0
     if not shown:
-        if focus != "auto":
+        if share is not None:
             say("No mask of a training photo shows an object: focus is off.")
         return None
     gain = float(np.mean([aim.gain for aim in shown]))
-    if focus == "auto" and (covered >= MOST_COVERED or gain < LEAST_GAIN):
+    if share is None and (covered >= MOST_COVERED or gain < LEAST_GAIN):
         if covered >= MOST_COVERED and gain >= LEAST_GAIN:
             say(f"Objects cover {covered:.0%} of the photos' pixels: training sees whole photos alone (focus is off).")
         return None
-    share = SHARE if focus == "auto" else float(focus)
+    share = SHARE if share is None else share
     side = float(np.mean([aim.side for aim in shown]))
     say(
         f"Objects cover {covered:.1%} of the photos' pixels: {share:.0%} of the steps see close-ups of them, in which "

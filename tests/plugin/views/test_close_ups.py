@@ -35,8 +35,8 @@ def write_objects(root, *boxes, views=9, size=(160, 120)) -> None:
     (root / "classes.json").write_text(json.dumps({"0": "background", **names}))
 
 
-def focused(root, focus="auto", downscale=4.0, **options):
-    data = manager(root, {"downscale_factor": downscale}, focus=focus, **options)
+def focused(root, focus: object = "auto", downscale=4.0, **options):
+    data = manager(root, {"downscale_factor": downscale}, focus=str(focus), **options)
     data.focus()
     return data
 
