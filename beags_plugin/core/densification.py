@@ -147,15 +147,23 @@ def length_units(means: Tensor, camera_centers: Tensor, extent: float, config: D
 
 
 def densify(
-    surfels: Surfels, mean_gradient: Tensor, units: Tensor, config: DensifyConfig, step: int, generator: torch.Generator
-) -> Densified:
+    surfels: Surfels, mean_gradient: Tensor, units: Tensor, config: DensifyConfig, step: int,
+    generator: torch.Generator, apart: tuple[Tensor, int] | None = None,
+) -> Densified:  # fmt: skip
     """Clone, split, prune.
 
     surfels: N surfels without gradients. mean_gradient: [N]. units: [N] of ``length_units``. step: for
-    ``prune_scale_after``. At least one surfel always remains.
+    ``prune_scale_after``. apart: [N] bool, surfels with a bound of their own, and that bound (0: none); the config's is
+    that of the others. At least one surfel always remains.
     """
     size = surfels.log_scales.exp().amax(dim=-1)
-    chosen = _within_budget(mean_gradient >= GRADIENT_THRESHOLD, mean_gradient, config.max_surfels)
+    chosen = mean_gradient >= GRADIENT_THRESHOLD
+    if apart is None:
+        chosen = _within_budget(chosen, mean_gradient, config.max_surfels, len(surfels))
+    else:
+        bounds = ((apart[0], apart[1]), (~apart[0], config.max_surfels))
+        parts = [_within_budget(chosen & part, mean_gradient, most, int(part.sum())) for part, most in bounds]
+        chosen = parts[0] | parts[1]
     small = size <= CLONE_SCALE * units
     edited = _grow(surfels, chosen & small, chosen & ~small, generator)
 
@@ -188,9 +196,12 @@ def _grow(surfels: Surfels, cloned: Tensor, split: Tensor, generator: torch.Gene
     return Densified(grown, source, fresh)
 
 
-def _within_budget(chosen: Tensor, gradient: Tensor, max_surfels: int) -> Tensor:
-    """Restrict the chosen to those of largest gradient that ``max_surfels`` leaves room for (0: no bound)."""
-    room = max(max_surfels - chosen.shape[0], 0)
+def _within_budget(chosen: Tensor, gradient: Tensor, max_surfels: int, count: int) -> Tensor:
+    """Restrict the chosen to those of largest gradient that ``max_surfels`` leaves room for (0: no bound).
+
+    count: of the surfels under that bound.
+    """
+    room = max(max_surfels - count, 0)
     if max_surfels <= 0 or int(chosen.sum()) <= room:
         return chosen
     order = torch.where(chosen, gradient, -1.0).argsort(descending=True, stable=True)[:room]

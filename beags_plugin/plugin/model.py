@@ -83,7 +83,7 @@ class BeagsModel(SceneModel):
             inputs = replace(inputs, colors=self.photo_colors(inputs.colors, metadata["cam_idx"]))
         settings = self.settings(geometry="geometry" in needs, distortion="distortion" in needs)
         render = self.rasterizer.rasterize(inputs, camera, settings, background, against)
-        self.last_render = LastRender(camera, render, inputs.screen_shift, labels)
+        self.last_render = LastRender(camera, render, inputs.screen_shift, labels, metadata.get("close_up", False))
         self.clock.mark("rendering")
         outputs = {"rgb": render.color, "accumulation": render.alpha[..., None], "background": background}
         if render.depth is not None:

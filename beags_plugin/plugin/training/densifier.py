@@ -12,6 +12,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import Densified, GradientStatistics, densify, length_units, reset_opacity
 from beags_plugin.core.free_space import nearest_depths, reaches_before_camera
 from beags_plugin.labels.class_ids import BACKGROUND
+from beags_plugin.plugin.training.near_growth import NearVotes, on_objects
 from beags_plugin.plugin.training.scene_edits import edit_scene, move_adam_state
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
@@ -30,7 +31,13 @@ class Densifier:
         self.datamanager = datamanager
         cameras = datamanager.train_dataset.cameras
         self.camera_centers = cameras.camera_to_worlds[:, :3, 3]  # [V, 3] world
-        self.config = model.config.densify.scaled(model.schedule.scale).bounded(datamanager.training_pixels)
+        pixels = int((cameras.height * cameras.width).sum())  # of all whole training images
+        stated = model.config.densify.scaled(model.schedule.scale)
+        self.config = stated.bounded(pixels)
+        close_ups = datamanager.close_ups
+        self.near = None if close_ups is None else NearVotes(model.num_points, model.device)
+        of_objects = 0 if close_ups is None else min(close_ups.object_pixels(), pixels)
+        self.most_near = stated.bounded(of_objects).max_surfels
         self.adam = adam
         self.statistics = GradientStatistics(model.num_points, model.device)
         self.free = self._free_depths()
@@ -41,7 +48,8 @@ class Densifier:
         See ``resumable.Resumable``.
         """
         found = self.statistics if self.model.growing else GradientStatistics(0)
-        return {"total": found.total, "views": found.views, "frees": self.free is not None}
+        near = {} if self.near is None else {"shown": self.near.shown, "inside": self.near.inside}
+        return {"total": found.total, "views": found.views, "frees": self.free is not None, "near": near}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on gathering, in the first process alone: a checkpoint lacks the statistics of the others."""
@@ -50,6 +58,9 @@ class Densifier:
         if processes.rank() == 0 and len(state["total"]) == self.model.num_points:
             kept = self.statistics
             kept.total, kept.views = state["total"].clone().to(kept.total), state["views"].clone().to(kept.views)
+            if self.near is not None and (near := state.get("near")):
+                self.near.shown = near["shown"].clone().to(self.near.shown)
+                self.near.inside = near["inside"].clone().to(self.near.inside)
 
     def before_step(self, step: int) -> None:
         """Have the step's screen gradients computed as long as the scene still grows; a trained one does not."""
@@ -77,17 +88,26 @@ class Densifier:
     def _gather(self) -> None:
         last = self.model.last_render
         if last is not None and last.screen_shift is not None and last.screen_shift.grad is not None:
-            self.statistics.add(last.screen_shift.grad.norm(dim=-1), last.render.visible)
+            gradient, visible = last.screen_shift.grad.norm(dim=-1), last.render.visible
+            if self.near is not None and last.close_up and last.labels is not None:
+                inside = on_objects(self.model.surfels().means.detach(), last.camera, last.labels)
+                self.near.add(inside, visible)
+                visible = visible & inside
+            self.statistics.add(gradient, visible)
 
     def _densify(self, step: int) -> None:
         model = self.model
         surfels = model.surfels().detach()
         processes.add_up([self.statistics.total, self.statistics.views])
         units = length_units(surfels.means, self.camera_centers, float(model.extent), self.config)
-        gradient = self.statistics.mean()
+        gradient, apart = self.statistics.mean(), None
+        if self.near is not None:
+            processes.add_up([self.near.shown, self.near.inside])
+            apart = self.near.near(), self.most_near
         if model.schedule.refining(step - 1):
-            gradient = torch.where(model.class_ids != BACKGROUND, gradient, 0.0)
-        self._edit(densify(surfels, gradient, units, self.config, step, model.generator(step)))
+            of_objects = model.class_ids != BACKGROUND
+            gradient, apart = torch.where(of_objects, gradient, 0.0), (of_objects, self.most_near)
+        self._edit(densify(surfels, gradient, units, self.config, step, model.generator(step), apart))
 
     def _free_cameras(self) -> None:
         """Remove the Gaussians that stand before a camera, where its photo shows what lies further off.
@@ -117,9 +137,11 @@ class Densifier:
         return cameras, self.config.free_share * nearest_depths(points, cameras)
 
     def _edit(self, edited: Densified, keep_statistics: bool = False) -> None:
-        model, gathered = self.model, self.statistics
+        model, gathered, near = self.model, self.statistics, self.near
         edit_scene(model, self.adam, edited)
         self.statistics = GradientStatistics(model.num_points, model.device)
+        if near is not None:
+            self.near = near.of(edited.source) if keep_statistics else NearVotes(model.num_points, model.device)
         if keep_statistics:
             self.statistics.total, self.statistics.views = (
                 values[edited.source] for values in (gathered.total, gathered.views)

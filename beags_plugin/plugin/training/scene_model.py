@@ -33,13 +33,14 @@ class LastRender:
     """The render of the last training step.
 
     screen_shift: [N, 2] of ``SurfelInputs``, whose gradient densification reads. labels: [H, W] int32 of the view, from
-    ``BeagsDataManager``; None if the data gives none.
+    ``BeagsDataManager``; None if the data gives none. close_up: whether it is of a close-up.
     """
 
     camera: Camera
     render: RasterOutputs
     screen_shift: Tensor | None
     labels: Tensor | None = None
+    close_up: bool = False
 
 
 class SceneModel(SplatfactoModel):

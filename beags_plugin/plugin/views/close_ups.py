@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera, cropped
-from beags_plugin.labels.class_ids import resize_nearest
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE, resize_nearest
 from beags_plugin.labels.label_maps import CompressedMap, to_int32
 from beags_plugin.plugin.views.dataset import resize_area
 from beags_plugin.plugin.views.photo_files import Box, PhotoFiles
@@ -51,7 +51,12 @@ class CloseUp:
             return torch.from_numpy(np.ascontiguousarray(values[top:bottom, left:right]))
 
         labels = part(resize_nearest(self.labels.unpacked().numpy(), *size[::-1]))
-        batch = {"image_idx": self.photo, "image": part(resize_area(self.image, *size)), "labels": labels}
+        batch = {
+            "image_idx": self.photo,
+            "close_up": True,
+            "image": part(resize_area(self.image, *size)),
+            "labels": labels,
+        }
         if self.alpha is not None:
             batch["alpha"] = part(resize_area(self.alpha, *size))
         return camera, batch
@@ -100,11 +105,14 @@ class CloseUps:
         for close_up, each in zip(self.close_ups, labels, strict=True):
             close_up.labels = CompressedMap(each.cpu())
 
-    @property
-    def training_pixels(self) -> int:
-        """Pixels of ``views``."""
-        sizes = (fitted(each.camera.width, each.camera.height, self.pixels) for each in self.close_ups)
-        return sum(width * height for width, height in sizes)
+    def object_pixels(self) -> int:
+        """Return the number of the pixels of objects, at the size that is kept."""
+        total = 0.0
+        for each in self.close_ups:
+            labels = to_int32(each.labels.unpacked())
+            share = ((labels != BACKGROUND) & (labels != IGNORE)).double().mean()
+            total += float(share) * each.camera.width * each.camera.height
+        return round(total)
 
 
 def _data(close_up: CloseUp, size: tuple[int, int], device: torch.device | str) -> dict[str, Tensor]:

@@ -106,13 +106,6 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             config.train_cameras_sampling_seed,
         )
 
-    @property
-    def training_pixels(self) -> int:
-        """Pixels of all whole training photos and of their close-ups."""
-        cameras = self.train_dataset.cameras
-        whole = int((cameras.height * cameras.width).sum())
-        return whole + (0 if self.close_ups is None else self.close_ups.training_pixels)
-
     def _add_dense_seeds(self) -> None:
         """Add seed points that photos agree on, where they are wanted; there are none without points to begin with."""
         seeds, wanted = self.train_dataparser_outputs.metadata, self.config.dense_seeds
@@ -168,6 +161,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         if own_camera is not self._camera(index):
             take_intrinsics(camera, own_camera)
         own = {"labels": data["labels"], "camera": own_camera, "objects_alone": "inside" in data}
+        own["close_up"] = data.get("close_up", False)
         camera.metadata = metadata | own
         if self._present is not None:
             data.setdefault("present", self._present[index])

@@ -8,7 +8,7 @@ import torch
 pytest.importorskip("nerfstudio")
 
 from resumed_runs import assert_same_run, checkpoint_of, interrupted, kill_at, resume_to_end, run_to_end, short_config
-from run_folders import write_scene
+from run_folders import write_drawn_scene, write_scene
 
 FOCUSED = {"pipeline.datamanager.focus": "0.5", "pipeline.datamanager.dataparser.downscale_factor": 2.0}
 
@@ -47,16 +47,18 @@ def test_close_ups_get_consistent_masks_of_their_own(focused):
     assert near and {name.partition("-close-up-")[0] for name in near} <= masks - near
 
 
-def test_refinement_sharpens_a_base_that_saw_no_close_ups(focused, tmp_path):
+def test_refinement_sharpens_a_base_that_saw_no_close_ups(tmp_path):
     """Gaussians of objects grow, those of the background do not, and nothing grows without focus."""
-    base = tmp_path / "base"
-    plain = {**FOCUSED, "pipeline.datamanager.focus": "off"}
-    run_to_end(short_config(focused / "data", base, **plain, **{"pipeline.model.refine_steps": 0}))
+    data, base = tmp_path / "data", tmp_path / "base"
+    write_drawn_scene(data)
+    plain = {**FOCUSED, "pipeline.datamanager.focus": "off", "pipeline.model.densify.stop": 0}
+    run_to_end(short_config(data, base, **plain, **{"pipeline.model.refine_steps": 0}))
 
     def refined(name: str, focus: str) -> dict:
         options = {**FOCUSED, "pipeline.datamanager.focus": focus, "load_dir": base / "nerfstudio_models"}
         steps = {"pipeline.model.base_steps": 0, "pipeline.model.refine_steps": 104}
-        run_to_end(short_config(focused / "data", tmp_path / name, **options, **steps))
+        steps["optimizers.opacities.optimizer.lr"] = 0.01
+        run_to_end(short_config(data, tmp_path / name, **options, **steps))
         return checkpoint_of(tmp_path / name)["pipeline"]
 
     off, on = refined("off", "off"), refined("on", "0.5")
