@@ -48,8 +48,8 @@ class Densifier:
         See ``resumable.Resumable``.
         """
         found = self.statistics if self.model.growing else GradientStatistics(0)
-        near = {} if self.near is None else {"shown": self.near.shown, "inside": self.near.inside}
-        return {"total": found.total, "views": found.views, "frees": self.free is not None, "near": near}
+        near = {} if self.near is None else {"near": [self.near.shown, self.near.inside]}
+        return {"total": found.total, "views": found.views, "frees": self.free is not None, **near}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on gathering, in the first process alone: a checkpoint lacks the statistics of the others."""
@@ -58,9 +58,9 @@ class Densifier:
         if processes.rank() == 0 and len(state["total"]) == self.model.num_points:
             kept = self.statistics
             kept.total, kept.views = state["total"].clone().to(kept.total), state["views"].clone().to(kept.views)
-            if self.near is not None and (near := state.get("near")):
-                self.near.shown = near["shown"].clone().to(self.near.shown)
-                self.near.inside = near["inside"].clone().to(self.near.inside)
+            if self.near is not None and "near" in state:
+                shown, inside = state["near"]
+                self.near.shown, self.near.inside = shown.clone().to(kept.total), inside.clone().to(kept.total)
 
     def before_step(self, step: int) -> None:
         """Have the step's screen gradients computed as long as the scene still grows; a trained one does not."""

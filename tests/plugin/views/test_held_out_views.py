@@ -6,6 +6,7 @@ import shutil
 
 import pytest
 import torch
+from data_folders import WIDTH
 from run_folders import write_scene
 
 pytest.importorskip("nerfstudio")
@@ -58,3 +59,17 @@ def test_truth_of_another_scene_is_named_and_nothing_ends(tmp_path):
         "as their photos, or remove them if they are of another scene."
     )
     assert views[0].silhouettes is None and views[0].visible is not None  # The scene's own masks serve.
+
+
+def test_photos_that_were_scaled_down_are_read_at_the_size_of_their_files(tmp_path):
+    data = write_scene(tmp_path)
+    assert opened(data)[0].full is None
+    parser = BeagsDataParserConfig(data=data, downscale_factor=2.0)
+    manager = BeagsDataManagerConfig(dataparser=parser).setup(device="cpu")
+    view, whole = HeldOutViews(manager, {0: "background"}, torch.zeros(3))[1], opened(data)[1]
+    assert view.camera.width == WIDTH // 2 and view.full.camera.width == WIDTH
+    assert torch.equal(view.full.camera.K, whole.camera.K)
+    camera, photo = view.full.region((3, 2, 9, 7))
+    assert torch.equal(photo, whole.image[2:7, 3:9]) and (camera.width, camera.height) == (6, 5)
+    shift = torch.tensor([[0, 0, 3.0], [0, 0, 2.0], [0, 0, 0]])
+    assert torch.equal(camera.K, whole.camera.K - shift) and torch.equal(camera.viewmat, view.camera.viewmat)
