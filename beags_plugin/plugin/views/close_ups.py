@@ -24,6 +24,8 @@ from beags_plugin.plugin.views.views import View
 
 DETAIL = 4.0
 """Pixels that are kept of all close-ups of a photo, in units of those that a step sees."""
+MOST_BYTES = 1e9
+"""Of the close-ups of all photos; with more, fewer pixels are kept, but no fewer than a step sees."""
 WINDOWS = 0.5
 """Share of the steps that see a window of their close-up where it has more pixels than a step; others see it shrunk."""
 
@@ -72,13 +74,28 @@ class CloseUps:
     def __init__(
         self, close_ups: Sequence[CloseUp], names: Sequence[str], pixels: int, share: float, seed: int
     ) -> None:
-        self.close_ups = close_ups
         self.pixels, self.share, self.seed = pixels, share, seed
+        self.close_ups: list[CloseUp] = []
         self._of_photo: dict[int, list[CloseUp]] = defaultdict(list)
-        self.names = []
+        self._photos = names
+        self.names: list[str] = []
+        self.add(close_ups)
+
+    def add(self, close_ups: Sequence[CloseUp]) -> None:
+        """Add close-ups of photos."""
+        self.close_ups += close_ups
         for each in close_ups:
             self._of_photo[each.photo].append(each)
-            self.names.append(f"{names[each.photo]}-close-up-{len(self._of_photo[each.photo])}")
+            self.names.append(f"{self._photos[each.photo]}-close-up-{len(self._of_photo[each.photo])}")
+
+    def blind(self) -> list[int]:
+        """Return the photos without a close-up."""
+        return [photo for photo in range(len(self._photos)) if photo not in self._of_photo]
+
+    @property
+    def kept(self) -> float:
+        """Pixels that are kept of all close-ups of a photo."""
+        return kept_pixels(self.pixels, len(self._photos))
 
     def drawn(self, photo: int, step: int) -> tuple[Camera, dict[str, Any]] | None:
         """Return camera and batch, on the CPU, of the close-up that ``step`` sees of a photo; None: the whole photo."""
@@ -131,22 +148,36 @@ def fitted(width: int, height: int, pixels: float) -> tuple[int, int]:
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
-def kept_size(box: Box, boxes: int, pixels: float) -> tuple[int, int]:
-    """Return width and height at which a close-up is kept, one of ``boxes`` of its photo. pixels: of a step."""
+def kept_pixels(pixels: int, photos: int) -> float:
+    """Return the number of pixels that are kept of all close-ups of one of ``photos``. pixels: of a step."""
+    return pixels * max(min(DETAIL, MOST_BYTES / (3.0 * pixels * photos)), 1.0)
+
+
+def kept_size(box: Box, boxes: int, kept: float) -> tuple[int, int]:
+    """Return width and height at which a close-up is kept, one of ``boxes`` of its photo. kept: ``kept_pixels``."""
     left, top, right, bottom = box
-    return fitted(right - left, bottom - top, DETAIL * pixels / boxes)
+    return fitted(right - left, bottom - top, kept / boxes)
 
 
-def read_close_ups(files: PhotoFiles, photo: int, boxes: Sequence[Box], pixels: float) -> list[CloseUp]:
-    """Read the close-ups of a photo; it is decoded once, and what is kept of it is bounded by ``pixels`` of a step."""
-    masks = files.mask_regions(photo, boxes)
-    assert masks is not None, "close-ups come from masks"
+def read_close_ups(
+    files: PhotoFiles, photo: int, boxes: Sequence[Box], kept: float, whole: np.ndarray | None = None
+) -> list[CloseUp]:
+    """Read the close-ups of a photo, which is decoded once.
+
+    kept: ``kept_pixels``. whole: labels [H, W] of the whole photo at any size, where it has no mask.
+    """
+    camera = files.full_camera(photo)
+    masks = files.mask_regions(photo, boxes) if whole is None else None
+    if masks is None:
+        assert whole is not None, "close-ups come from masks"
+        sized = resize_nearest(whole, camera.height, camera.width)
+        masks = [sized[top:bottom, left:right] for left, top, right, bottom in boxes]
     found = []
     for number, (box, region) in enumerate(zip(boxes, files.full_regions(photo, boxes), strict=True)):
-        size = kept_size(box, len(boxes), pixels)
+        size = kept_size(box, len(boxes), kept)
         left, top, right, bottom = box
-        camera = small_camera(cropped(files.full_camera(photo), left, top, right - left, bottom - top), size)
+        own = small_camera(cropped(camera, left, top, right - left, bottom - top), size)
         alpha = resize_area(region["alpha"].numpy(), *size) if "alpha" in region else None
         labels = CompressedMap(torch.from_numpy(resize_nearest(masks[number], size[1], size[0]).astype(np.int32)))
-        found.append(CloseUp(photo, camera, resize_area(region["image"].numpy(), *size), alpha, labels))
+        found.append(CloseUp(photo, own, resize_area(region["image"].numpy(), *size), alpha, labels))
     return found

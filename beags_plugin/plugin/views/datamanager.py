@@ -27,7 +27,7 @@ from beags_plugin.plugin.views.close_ups import CloseUps
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig, absolute
 from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.plugin.views.dense_seeds import MOST_PHOTOS, with_dense_seeds
-from beags_plugin.plugin.views.focus import focused
+from beags_plugin.plugin.views.focus import aim_by, focused
 from beags_plugin.plugin.views.objects_alone import objects_alone
 from beags_plugin.plugin.views.photo_files import PhotoFiles
 from beags_plugin.plugin.views.small_views import SizeAt, SmallViews
@@ -317,3 +317,4 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         self._present = present
         if self.close_ups is not None:
             self.close_ups.replace_labels(of_close_ups)
+            aim_by(self.close_ups, self.files["train"], labels)

@@ -14,7 +14,7 @@ import numpy as np
 from torch import Tensor
 
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
-from beags_plugin.plugin.views.close_ups import CloseUps, kept_size, read_close_ups
+from beags_plugin.plugin.views.close_ups import CloseUps, kept_pixels, kept_size, read_close_ups
 from beags_plugin.plugin.views.photo_files import Box, PhotoFiles
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
@@ -71,8 +71,9 @@ def focused(
         return None
     cameras = files.cameras
     pixels = max(round(float((cameras.width * cameras.height).double().mean())), 1)
+    kept = kept_pixels(pixels, len(cameras))
     aims = {
-        photo: _aim(files, photo, found.cpu().numpy(), pixels)
+        photo: _aim(files, photo, found.cpu().numpy(), kept)
         for photo in range(len(cameras))
         if (found := labels(photo)) is not None
     }
@@ -94,12 +95,21 @@ def focused(
         f"they are about {side * gain:.0f} pixels large, not {side:.0f}."
     )
     with ThreadPoolExecutor(max_workers=2) as pool:
-        read = pool.map(lambda photo: read_close_ups(files, photo, aims[photo].boxes, pixels), aims)
+        aimed = [photo for photo, aim in aims.items() if aim.boxes]
+        read = pool.map(lambda photo: read_close_ups(files, photo, aims[photo].boxes, kept), aimed)
         close_ups = [close_up for of_photo in read for close_up in of_photo]
     return CloseUps(close_ups, names, pixels, share, seed)
 
 
-def _aim(files: PhotoFiles, photo: int, labels: np.ndarray, pixels: int) -> Aim:
+def aim_by(close_ups: CloseUps, files: PhotoFiles, labels: Sequence[Tensor]) -> None:
+    """Add close-ups of photos that have none, where their labels [H, W] int show objects, as after reprojection."""
+    for photo in close_ups.blind():
+        whole = labels[photo].cpu().numpy().astype(np.int32)
+        if boxes := _aim(files, photo, whole, close_ups.kept).boxes:
+            close_ups.add(read_close_ups(files, photo, boxes, close_ups.kept, whole))
+
+
+def _aim(files: PhotoFiles, photo: int, labels: np.ndarray, kept: float) -> Aim:
     covered = float(((labels != BACKGROUND) & (labels != IGNORE)).mean())
     parts = list(_boxes(labels))
     if not parts:
@@ -108,7 +118,7 @@ def _aim(files: PhotoFiles, photo: int, labels: np.ndarray, pixels: int) -> Aim:
     scale = np.array([camera.width / labels.shape[1], camera.height / labels.shape[0]] * 2)
     full = partial(_full_box, scale=scale, width=camera.width, height=camera.height)
     boxes = [full(box) for box in _joined([_with_margin(box) for box in parts])]
-    shares = [np.prod(kept_size(box, len(boxes), pixels)) / _area(box) for box in boxes]
+    shares = [np.prod(kept_size(box, len(boxes), kept)) / _area(box) for box in boxes]
     gain = float(np.sqrt(np.average(shares, weights=[_area(box) for box in boxes]) * scale[0] * scale[1]))
     side = float(np.sqrt(np.mean([_area(box) for box in parts])))
     return Aim(boxes, covered, gain, side)

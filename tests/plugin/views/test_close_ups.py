@@ -162,12 +162,22 @@ def test_specks_do_not_widen_a_close_up_and_a_few_pixels_get_one(tmp_path):
     assert (by_photo[1].width, by_photo[1].height) == (LEAST_SIDE, LEAST_SIDE)  # in the corner of its photo
 
 
-def test_mixed_sizes_and_photos_without_a_mask(tmp_path):
+def test_a_photo_without_a_mask_gets_one_from_the_others(tmp_path):
     write_objects(tmp_path, (40, 30, 80, 60))
     (tmp_path / "masks/v03.png").unlink()
     data = focused(tmp_path, 1.0)
     photo = [view.name for view in data.views("train")].index("v03")
     assert data.close_ups.drawn(photo, 0) is None and len(data.close_ups.close_ups) == 6
+    views = data.close_up_views()
+    voted = [
+        view.labels if view.labels is not None else torch.zeros(30, 40, dtype=torch.int32)
+        for view in data.views("train")
+    ]
+    voted[photo][10:20, 5:15] = 1
+    data.replace_labels(voted, [view.labels for view in views])  # reprojection has found the object there
+    camera, batch = data.close_ups.drawn(photo, 0)
+    assert len(data.close_ups.close_ups) == 7 and batch["labels"].shape == (camera.height, camera.width)
+    assert 0.3 < float((batch["labels"] == 1).float().mean()) < 0.9
 
 
 def test_other_labels_take_the_place_of_the_masks(tmp_path):
