@@ -12,7 +12,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import Densified, GradientStatistics, densify, length_units, reset_opacity
 from beags_plugin.core.free_space import nearest_depths, reaches_before_camera
 from beags_plugin.labels.class_ids import BACKGROUND
-from beags_plugin.plugin.training.near_growth import NearVotes, on_objects
+from beags_plugin.plugin.training.near_growth import NearVotes, on_objects, shared_pixels
 from beags_plugin.plugin.training.scene_edits import edit_scene, move_adam_state
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
@@ -32,12 +32,10 @@ class Densifier:
         cameras = datamanager.train_dataset.cameras
         self.camera_centers = cameras.camera_to_worlds[:, :3, 3]  # [V, 3] world
         pixels = int((cameras.height * cameras.width).sum())  # of all whole training images
-        stated = model.config.densify.scaled(model.schedule.scale)
-        self.config = stated.bounded(pixels)
-        close_ups = datamanager.close_ups
+        stated, close_ups = model.config.densify.scaled(model.schedule.scale), datamanager.close_ups
+        of_objects, elsewhere = (0, pixels) if close_ups is None else shared_pixels(pixels, close_ups.object_pixels())
+        self.config, self.most_near = stated.bounded(elsewhere), stated.bounded(of_objects).max_surfels
         self.near = None if close_ups is None else NearVotes(model.num_points, model.device)
-        of_objects = 0 if close_ups is None else min(close_ups.object_pixels(), pixels)
-        self.most_near = stated.bounded(of_objects).max_surfels
         self.adam = adam
         self.statistics = GradientStatistics(model.num_points, model.device)
         self.free = self._free_depths()

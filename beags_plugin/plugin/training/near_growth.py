@@ -11,6 +11,18 @@ from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 MOST = 0.5
 """Share of the close-ups showing a Gaussian from which on it counts as near, if they show it on objects."""
 
+MORE = 1.2
+"""Bound of all Gaussians with close-ups, in units of that without: they take time."""
+
+
+def shared_pixels(whole: int, of_objects: int) -> tuple[int, int]:
+    """Return the pixels that bound the Gaussians near objects, and those that bound the others.
+
+    whole: of all whole training photos. of_objects: those of objects in close-ups.
+    """
+    near = min(of_objects, round(MORE / 2 * whole))
+    return near, min(round(MORE * whole) - near, whole)
+
 
 class NearVotes:
     """Of N Gaussians, the number of close-ups that show them, and of those that show them on an object."""
