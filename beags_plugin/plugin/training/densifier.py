@@ -46,7 +46,9 @@ class Densifier:
         See ``resumable.Resumable``.
         """
         found = self.statistics if self.model.growing else GradientStatistics(0)
-        near = {} if self.near is None else {"near": [self.near.shown, self.near.inside]}
+        near = {}
+        if self.near is not None and self.model.growing:
+            near = {"near": [self.near.shown, self.near.inside]}
         return {"total": found.total, "views": found.views, "frees": self.free is not None, **near}
 
     def restore(self, state: dict[str, Any]) -> None:

@@ -193,7 +193,7 @@ def test_only_steps_of_growth_gather_gradients(model):
     camera = Cameras(pose, one, one, torch.tensor([16.0]), torch.tensor([12.0]), 32, 24)
     model.train()
     model.schedule, model.extent = PhaseSchedule(30_000, 0, 30_000), torch.tensor(1.0)
-    data = SimpleNamespace(train_dataset=SimpleNamespace(cameras=camera))
+    data = SimpleNamespace(train_dataset=SimpleNamespace(cameras=camera), close_ups=None)
     densifier = Densifier(model, {}, data)
 
     def gathered(step):
