@@ -57,9 +57,9 @@ class BeagsDataManagerConfig(FullImageDatamanagerConfig):
     """Whether a base begins with more seed points, on whose depth several photos agree; auto: where there are at most
     50 photos, of which features give few points. It takes one or two seconds a photo."""
     begins: Suppress[bool] = False  # whether a base is to begin with seed points, which the pipeline says
-    focus: str = "auto"
+    focus: str = "off"
     """Share of the steps that see close-ups of objects, at up to the size of the photos' files, and not whole photos.
-    auto: half, where masks cover less than 40 % of the photos' pixels and photos are scaled down; off: none."""
+    off: none; auto: half, where masks cover less than 40 % of the photos' pixels and photos are scaled down."""
     photos: Literal["all", "objects"] = "all"
     """What training sees of the photos: all, or objects, their pixels alone before a random colour (turntables)."""
 
