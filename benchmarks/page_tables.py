@@ -114,7 +114,7 @@ TABLES: tuple[PageTable, ...] = (
     PageTable(
         "docs/comparison.md",
         "comparison",
-        {"digger, 260 pixels": ("comparison-kitchen", DIGGER)},
+        {"bear, 260 pixels": ("comparison-bear", BEAR), "digger, 260 pixels": ("comparison-kitchen", DIGGER)},
         (
             "assignment alone",
             "flashsplat",

@@ -13,7 +13,8 @@ from beags_plugin.cleaning.silhouettes import MaskedViews
 from beags_plugin.core.surfels import Surfels
 
 OUTSIDE = 0.2  # share of a Gaussian's weight outside the masks from which on it may be left out
-CHIP = 0.005  # share of an object's weight inside its masks below which a part far from it is a chip
+CHIP = 0.005  # share of an object's weight inside its masks below which a part far from it may be a chip
+CHIP_SUPPORT = 2.0  # times its weight outside the masks and hidden, which a part inside them has that is no chip
 FAR = 0.1  # of the object's longest side
 MOST = 0.5  # share of an object's Gaussians; where more would go, masks and object contradict each other
 
@@ -36,7 +37,7 @@ class LeftOut:
             f"{count} {why}"
             for count, why in (
                 (self.outside, "that reach outside its masks"),
-                (self.loose, "in loose parts that no mask supports"),
+                (self.loose, "in loose parts that hardly any mask supports"),
             )
             if count
         ]
@@ -53,7 +54,7 @@ def clean(part: Surfels, class_id: int, views: MaskedViews) -> tuple[Tensor, Lef
     masks, where nothing hides it; it is left out unless that opens more in the masks than it clears beside them. Of the
     rest, parts that hang together with no other (``connected_parts``) are left out if they have no more weight inside
     the masks than outside; the part with the most weight inside stays. Parts far from it that have next to none of the
-    weight inside are errors that a few masks share, and are left out too.
+    weight inside, and less than twice as much as outside and hidden, are errors that a few masks share: they go too.
 
     part: M Gaussians of class ``class_id``, in the frame of the views. If more than half of them would go, none does.
     """
@@ -72,7 +73,7 @@ def clean(part: Surfels, class_id: int, views: MaskedViews) -> tuple[Tensor, Lef
         loose[within.argmax()] = False
     dropped = spikes.copy()
     dropped[left[loose[parts]]] = True
-    dropped |= _chips(part, inside, dropped)
+    dropped |= _chips(part, evidence, dropped)
     if dropped.sum() > MOST * len(part):
         doubt = f"its masks contradict {int(dropped.sum())} of its {len(part)} Gaussians"
         return torch.arange(len(part)), LeftOut(doubt=doubt)
@@ -80,13 +81,15 @@ def clean(part: Surfels, class_id: int, views: MaskedViews) -> tuple[Tensor, Lef
     return keep, LeftOut(int(spikes.sum()), int((dropped & ~spikes).sum()))
 
 
-def _chips(part: Surfels, inside: np.ndarray, dropped: np.ndarray) -> np.ndarray:
-    """Return [M] bool, the Gaussians of small parts that lie ``FAR`` from all else; inside: [M] weight in the masks."""
+def _chips(part: Surfels, evidence: np.ndarray, dropped: np.ndarray) -> np.ndarray:
+    """Return [M] bool, the Gaussians of small parts that lie ``FAR`` from all else; evidence: [M, 4] of the masks."""
     chips = np.zeros(len(part), bool)
     left = np.flatnonzero(~dropped)
     parts = connected_parts(part[torch.from_numpy(left)], FAR)
     left, parts = left[parts >= 0], parts[parts >= 0]
     if len(left):
-        within = np.bincount(parts, inside[left])
-        chips[left[(within < CHIP * within.sum())[parts]]] = True
+        within, beyond, behind = (np.bincount(parts, evidence[left, column]) for column in range(3))
+        small = (within < CHIP * within.sum()) & (within < CHIP_SUPPORT * (beyond + behind))
+        small[within.argmax()] = False
+        chips[left[small[parts]]] = True
     return chips

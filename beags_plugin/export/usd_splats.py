@@ -57,9 +57,9 @@ class UsdSplatsExporter(Exporter):
         try:
             import pxr.UsdVol as volumes  # pyright: ignore[reportMissingImports]  (an extra)
         except ImportError as error:
-            return f"Pixar's USD library cannot be loaded ({error}); pip install beags[usd]."
+            return f"Pixar's USD library cannot be loaded ({error}); pip install 'usd-core>=26.3'."
         if not hasattr(volumes, "ParticleField3DGaussianSplat"):
-            return "Pixar's USD library is older than 26.3 and knows no splats; pip install --upgrade beags[usd]."
+            return "Pixar's USD library is older than 26.3 and knows no splats; pip install 'usd-core>=26.3'."
         return None
 
     def _write_layer(self, layer: Path, item: ExportItem) -> dict[str, Any]:

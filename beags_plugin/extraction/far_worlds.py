@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +100,20 @@ def write_origin(folder: Path, origin: Tensor, files: list[str]) -> Path:
     return path
 
 
+def unlist(folder: Path, names: Collection[str]) -> None:
+    """Take files that were written anew out of ``ORIGIN_FILE``; the last one takes that with it."""
+    path = folder / ORIGIN_FILE
+    if not path.is_file():
+        return
+    content = _read(path)
+    left = [name for name in content["files"] if name not in names]
+    if not left:
+        path.unlink()
+    elif len(left) < len(content["files"]):
+        with whole_file(path) as part:
+            part.write_text(json.dumps({"origin": list(content["origin"]), "files": left}, indent=1), "utf8")
+
+
 def origin_of(path: Path) -> Tensor | None:
     """Return the origin [3] float64 that ``ORIGIN_FILE`` beside a file gives it; None if it is not named there."""
     beside = path.parent / ORIGIN_FILE
@@ -112,8 +126,8 @@ def _read(path: Path) -> Mapping:
         content = load_json(path)
         if len(content["origin"]) != 3 or not all(math.isfinite(value) for value in content["origin"]):
             raise ValueError("its origin is no point")
-        if not isinstance(content["files"], list):
-            raise ValueError("its files are no list")
+        if not isinstance(content["files"], list) or not all(isinstance(name, str) for name in content["files"]):
+            raise ValueError("its files are no list of names")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} cannot be read ({reason(error)}): restore it, or remove it.") from error
     return content

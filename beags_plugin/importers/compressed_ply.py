@@ -58,6 +58,8 @@ class CompressedPlyImporter(Importer):
             rest = np.zeros((len(vertex), 0, 3))
             if sh is not None:
                 names = [f"f_rest_{index}" for index in range(len(sh.dtype.names or ()))]
+                if len(sh) != len(vertex) or len(names) not in (9, 24, 45, 72):
+                    raise ValueError(f"it has {len(sh)} rows of {len(names)} colour bands for {len(vertex)} Gaussians")
                 steps = np.stack([sh[name] for name in names], axis=1).astype(np.float64)
                 steps = steps.reshape(len(vertex), 3, -1).transpose(0, 2, 1)
                 rest = _SH_RANGE * ((steps + 0.5) / 256.0 - 0.5)

@@ -82,10 +82,16 @@ class _Document:
     def placed(self) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
         """Yield the primitives of Gaussians of the scene, and the matrix [4, 4] from each to the scene."""
         nodes, scenes = self._content.get("nodes", []), self._content.get("scenes", [])
-        chosen = scenes[self._content.get("scene", 0)]["nodes"] if scenes else range(len(nodes))
+        below = {child for node in nodes for child in node.get("children", [])}
+        roots = [number for number in range(len(nodes)) if number not in below]
+        chosen = scenes[self._content.get("scene", 0)]["nodes"] if scenes else roots
+        seen: set[int] = set()
         waiting = [(number, np.eye(4), 0) for number in reversed(list(chosen))]
         while waiting:
             number, above, depth = waiting.pop()
+            if number in seen:
+                raise ValueError(f"its node {number} is below two others, or below itself")
+            seen.add(number)
             node = nodes[number]
             matrix = above @ _matrix(node)
             if depth > _DEEPEST:
@@ -129,7 +135,12 @@ class _Document:
         content = self._buffer(view["buffer"])
         start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         stride = view.get("byteStride", dtype.itemsize * width)
-        if count < 1 or start < 0 or start + stride * (count - 1) + dtype.itemsize * width > len(content):
+        if (
+            count < 1
+            or start < 0
+            or stride < dtype.itemsize * width
+            or start + stride * (count - 1) + dtype.itemsize * width > len(content)
+        ):
             raise ValueError(f"accessor {number} does not fit into its buffer")
         found = np.ndarray((count, width), dtype, content, start, (stride, dtype.itemsize)).astype(np.float64)
         if accessor.get("normalized"):

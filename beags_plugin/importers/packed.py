@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from beags_plugin.core.flattening import Gaussians
@@ -21,7 +22,11 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.stand_ins import stand_in
 from beags_plugin.system.reading.text import reason
 
-_DAMAGED = (ValueError, LookupError, TypeError, OverflowError, EOFError, MemoryError, struct.error, zlib.error)
+_DAMAGED = (
+    ValueError, LookupError, TypeError, AttributeError, OverflowError, EOFError, MemoryError, RuntimeError,
+    struct.error, zlib.error, zipfile.BadZipFile, Image.DecompressionBombError,
+)  # fmt: skip
+"""What a file whose parts are not what they should be raises: JSON of other types, nested too deeply, encrypted."""
 _UNEVEN = 1e-3  # by which axes of a matrix may differ in length or from right angles
 MOST_ZIPPED = 1032  # bytes that one byte of deflate can stand for
 
@@ -31,7 +36,7 @@ def reading(path: Path, kind: str) -> Iterator[None]:
     """Turn what a missing or damaged file of a ``kind``, such as ".spz", makes the block raise into a ``UserError``."""
     try:
         yield
-    except (*_DAMAGED, OSError, zipfile.BadZipFile, NotImplementedError) as error:
+    except (*_DAMAGED, OSError) as error:
         if isinstance(error, OSError) and error.errno is not None:  # bare ones of libraries are of the content
             raise UserError(f"{path} cannot be read ({reason(error)}): name an existing {kind} file.") from error
         if (cause := stand_in(path)) is not None:
@@ -47,7 +52,12 @@ def tensor(values: np.ndarray) -> Tensor:
 def gaussians_of(
     means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, alphas: np.ndarray, dc: np.ndarray, rest: np.ndarray
 ) -> Gaussians:
-    """Return N Gaussians from arrays as in ``core.flattening.Gaussians``, but opacities 0..1; bands above 3 are cut."""
+    """Return N Gaussians from arrays as in ``core.flattening.Gaussians``, but opacities 0..1; bands above 3 are cut.
+
+    Raises ``ValueError`` for arrays of different lengths.
+    """
+    if len({len(each) for each in (means, quats, log_scales, alphas, dc, rest)}) > 1:
+        raise ValueError("its Gaussians have not as many places as rotations, scales, opacities or colours")
     rest = rest[:, : num_sh_bases(MAX_DEGREE) - 1]
     logits = torch.logit(torch.from_numpy(np.ascontiguousarray(alphas, dtype=np.float64))).float()
     return Gaussians(tensor(means), tensor(quats), tensor(log_scales), logits, tensor(dc), tensor(rest))

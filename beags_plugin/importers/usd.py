@@ -37,7 +37,7 @@ class UsdImporter(Importer):
         try:
             Usd, UsdGeom, Tf = (import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom", "Tf"))
         except ImportError as error:
-            raise UserError(f"{path} needs Pixar's USD library ({error}): pip install beags[usd].") from error
+            raise UserError(f"{path} needs Pixar's USD library ({error}): pip install 'usd-core>=26.3'.") from error
         with reading(path, "USD of splats"):
             try:
                 stage = Usd.Stage.Open(str(path))

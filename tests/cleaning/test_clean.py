@@ -100,7 +100,7 @@ def test_a_chip_that_others_hide_in_every_photo_is_left_out():
     part = joined(body, chip)
     keep, left_out = clean(part, 1, views(true, classes, joined(true, chip)))
     assert keep.tolist() == list(range(200)) and left_out == LeftOut(loose=6)
-    assert str(left_out) == "6 in loose parts that no mask supports left out"
+    assert str(left_out) == "6 in loose parts that hardly any mask supports left out"
 
 
 def test_a_part_that_masks_show_apart_stays():
@@ -117,14 +117,16 @@ def test_a_part_that_masks_show_apart_stays():
 
 
 def test_a_chip_that_a_few_masks_take_for_the_object_is_left_out():
-    """The masks of two views show it; a part as small that touches the object's surroundings stays."""
-    body, chip = ball(), ball((1.3, 0.0, 0.0), 0.03, 6)
+    """Another thing hides it in half of the views; what all masks show stays, and what is near."""
+    body, chip = ball(), ball((1.3, 0.0, 0.0), 0.02, 6)
     scene = joined(body, chip)
-    shown, unseen = (views(each, ones(each), scene).labels for each in (scene, body))
-    labels = [*shown[:2], *(torch.where(a != b, 65535, b) for a, b in zip(shown[2:], unseen[2:], strict=True))]
-    masked = replace(views(scene, ones(scene), scene), labels=labels)
+    assert len(clean(scene, 1, views(scene, ones(scene), scene))[0]) == 206
+    screen = ball((1.3, 0.0, 0.0), 0.15, 60)
+    screen = screen[screen.means[:, 1] < 0.06]  # a good half of a shell
+    whole = joined(scene, screen)
+    masked = views(whole, torch.cat([ones(scene), 2 * ones(screen)]), whole)
     inside, outside, hidden, _ = masked.evidence(scene, 1)[200:].sum(axis=0)
-    assert inside > outside + hidden, "the masks support it"
+    assert outside + hidden < inside < 2 * (outside + hidden)
     keep, left_out = clean(scene, 1, masked)
     assert keep.tolist() == list(range(200)) and left_out == LeftOut(loose=6)
     near = joined(body, ball((0.6, 0.0, 0.0), 0.03, 6))

@@ -67,6 +67,45 @@ def values(content: dict[str, Any], binary: bytes, number: int) -> np.ndarray:
     return found.reshape(accessor["count"], width)
 
 
+def changed(path: Path, change) -> Path:
+    """Write a .glb with another JSON, which ``change`` returns or changes."""
+    content, binary = content_of(path)
+    text = json.dumps(change(content) or content).encode()
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
+    return path
+
+
+def test_without_scenes_each_node_is_taken_once_where_its_parents_put_it(tmp_path):
+    surfels, _ = write_scene(tmp_path / "a.glb")
+    whole = read_scene(tmp_path / "a.glb").gaussians.means
+
+    def below_one(content):
+        del content["scenes"], content["scene"]
+        content["nodes"].append({"children": list(range(len(content["nodes"]))), "scale": [2.0, 2.0, 2.0]})
+
+    found = read_scene(changed(tmp_path / "a.glb", below_one)).gaussians.means
+    assert len(found) == len(surfels) and torch.allclose(found, 2.0 * whole, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda content: [content], "is no .glb of splats"),
+        (lambda content: {**content, "asset": "none"}, "is no .glb of splats"),
+        (lambda content: content["nodes"][0].update(children=[0]), "or below itself"),
+        (lambda content: content["scenes"][0]["nodes"].extend([0, 0]), "is below two others"),
+        (lambda content: [view.update(byteStride=0) for view in content["bufferViews"]] and None, "does not fit"),
+        (lambda content: content["accessors"][0].update(count=1), "not as many places|does not fit"),
+    ],
+)
+def test_a_damaged_tree_is_refused_in_one_sentence(tmp_path, change, words):
+    write_scene(tmp_path / "a.glb")
+    with pytest.raises(UserError, match=words):
+        read_scene(changed(tmp_path / "a.glb", change))
+
+
 def test_there_is_a_node_for_each_object_with_its_name(tmp_path):
     surfels, ids = write_scene(tmp_path / "scene.glb")
     content, _ = content_of(tmp_path / "scene.glb")

@@ -66,7 +66,7 @@ class RayEngine(Engine):
     def unavailable(cls) -> str | None:
         """Say how to install Ray if it is missing."""
         if importlib.util.find_spec("ray") is None:
-            return "the engine ray needs Ray: pip install 'beags[ray]'."
+            return "the engine ray needs Ray: pip install 'ray>=2.50'."
         return None
 
     def __init__(self, address: str | None) -> None:

@@ -56,7 +56,7 @@ class Sam2Source(MaskSource):
     @classmethod
     def unavailable(cls) -> str | None:
         if find_spec("transformers") is None:
-            return "the library transformers is not installed: pip install beags[sam2]."
+            return "the library transformers is not installed: pip install 'transformers>=5.0'."
         return None
 
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:

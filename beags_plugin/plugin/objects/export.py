@@ -18,7 +18,7 @@ from beags_plugin.export.frames import Frame, check_placement
 from beags_plugin.export.mesh import open3d_missing
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.pose_options import PoseOptions
-from beags_plugin.extraction.far_worlds import local_origin, said_of_far, to_world, write_origin
+from beags_plugin.extraction.far_worlds import local_origin, said_of_far, to_world, unlist, write_origin
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.plugin.objects.export_job import ExportJob, Progress, Shown, Steps
 from beags_plugin.plugin.objects.exported import Exported, ExportedFile
@@ -120,7 +120,9 @@ def export_run(
     if whole:
         items.append((WHOLE, None, whole_title))
     suffixes = [exporter.suffix for exporter in exporters.values()]
-    _clear_up(folder, None if everything else {f"{title}.{suffix}" for *_, title in items for suffix in suffixes})
+    written = {f"{title}.{suffix}" for *_, title in items for suffix in suffixes}
+    _clear_up(folder, None if everything else written)
+    unlist(folder, written)
     steps = Steps(job.steps(), len(items), progress or (lambda done, total: None))
     exported = [job.export(name, class_id, folder / title, steps) for name, class_id, title in items]
     if job.shift is not None:

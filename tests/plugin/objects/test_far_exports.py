@@ -72,6 +72,13 @@ def test_formats_of_single_precision_say_where_their_origin_lies(far, tmp_path):
     assert np.abs(exact.numpy() - origin).max() < 10
 
 
+def test_a_file_that_is_written_anew_about_itself_has_no_origin_any_more(far, tmp_path):
+    for frame in ("world", "object"):
+        export_run(far, ("cup",), formats=("spz", "ply"), output=tmp_path, placement=frame, keep_all=True)
+        assert (origin_of(tmp_path / "cup.spz") is None) == (frame == "object")
+    assert not (tmp_path / "origin.json").exists()
+
+
 def test_the_manifest_names_the_origin(far, tmp_path):
     export_run(far, everything=True, formats=("ply", "spz"), output=tmp_path, keep_all=True)
     content = json.loads((tmp_path / "manifest.json").read_text())
