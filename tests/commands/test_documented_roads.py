@@ -84,7 +84,7 @@ def reader(tmp_path_factory):
     [
         ("masks.md", "GrabCut", ["ns-train", "beags", "beags", "ns-train"]),
         ("masks.md", "Reproject", ["beags", "ns-train"]),
-        ("training.md", "Starting from a trained scene", ["ns-train"] * 4),
+        ("training.md", "Starting from a trained scene", ["ns-train"] * 3),
     ],
 )
 def test_the_commands_of_a_road_lead_to_refined_objects(reader, monkeypatch, document, heading, programs):

@@ -40,6 +40,7 @@ from beags_plugin.plugin.runs.picked import write_picked
 from beags_plugin.plugin.runs.read import read_run
 from beags_plugin.plugin.training.exposure import GAMMA, RATES, PhotoExposures, exposures_of_run, photo_gains
 from beags_plugin.plugin.views.datamanager import BeagsDataManager, BeagsDataManagerConfig
+from beags_plugin.plugin.views.photo_files import PhotoFiles
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.sample.exposure import photo_gains as true_gains
 from beags_plugin.sample.writer import SampleConfig, write_sample
@@ -116,17 +117,17 @@ def test_gains_of_a_generated_scene(folder, options):
 
 def test_points_beside_a_photo_without_its_lens_do_not_count(folder, monkeypatch):
     manager = manager_of(folder(**EXPOSED))
-    found, straightened = photo_gains(manager), BeagsDataManager.straightened
+    found, straightened = photo_gains(manager), PhotoFiles.straightened
     tracks = [(np.tile(ids, 2), np.tile(places, (2, 1))) for ids, places in manager.dataparser.tracks("train")]
     monkeypatch.setattr(manager.dataparser, "tracks", lambda split: [(ids[::-1], at) for ids, at in tracks])
 
-    def beside(self, places, index, split):
-        camera, xy = straightened(self, places, index, split)
+    def beside(self, places, index):
+        camera, xy = straightened(self, places, index)
         xy = xy[: len(xy) // 2]
         out = [-0.1, 1.0] if index % 2 else [1.0, camera.height]
         return camera, np.concatenate([np.full_like(xy, out), xy[::-1]])
 
-    monkeypatch.setattr(BeagsDataManager, "straightened", beside)
+    monkeypatch.setattr(PhotoFiles, "straightened", beside)
     assert np.array_equal(photo_gains(manager).stops, found.stops)
 
 
