@@ -40,8 +40,8 @@ from beags_plugin.plugin.runs.picked import write_picked
 from beags_plugin.plugin.runs.read import read_run
 from beags_plugin.plugin.training.exposure import GAMMA, RATES, PhotoExposures, exposures_of_run, photo_gains
 from beags_plugin.plugin.views.datamanager import BeagsDataManager, BeagsDataManagerConfig
-from beags_plugin.plugin.views.photo_files import PhotoFiles
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+from beags_plugin.plugin.views.photo_files import PhotoFiles
 from beags_plugin.sample.exposure import photo_gains as true_gains
 from beags_plugin.sample.writer import SampleConfig, write_sample
 from beags_plugin.system.errors import UserError
