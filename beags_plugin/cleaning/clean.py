@@ -15,7 +15,7 @@ from beags_plugin.core.surfels import Surfels
 OUTSIDE = 0.2  # share of a Gaussian's weight outside the masks from which on it may be left out
 CHIP = 0.005  # share of an object's weight inside its masks below which a part far from it may be a chip
 CHIP_SUPPORT = 2.0  # times its weight outside the masks and hidden, which a part inside them has that is no chip
-FAR = 0.1  # of the object's longest side
+FAR = 0.1  # distance of a chip from all else, over the object's longest side
 MOST = 0.5  # share of an object's Gaussians; where more would go, masks and object contradict each other
 
 

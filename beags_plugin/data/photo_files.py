@@ -69,7 +69,7 @@ class PhotoFinder:
         parts = [part for part in PurePosixPath(plain).parts if part.strip("/")]
         if not parts:
             return None
-        elsewhere = self.loose_folders or plain.startswith("/")  # of another machine
+        elsewhere = self.loose_folders or plain.startswith("/")  # a path of another machine
         for root in self.roots:
             if (path := self._below(root, parts)) is not None:
                 return path

@@ -27,7 +27,7 @@ _DAMAGED = (
     struct.error, zlib.error, zipfile.BadZipFile, Image.DecompressionBombError,
 )  # fmt: skip
 """What a file whose parts are not what they should be raises: JSON of other types, nested too deeply, encrypted."""
-_UNEVEN = 1e-3  # by which axes of a matrix may differ in length or from right angles
+_UNEVEN = 1e-3  # largest difference of a matrix's axes in length, and from right angles
 MOST_ZIPPED = 1032  # bytes that one byte of deflate can stand for
 
 

@@ -67,7 +67,7 @@ def _gaussians(prim: Any) -> tuple[Gaussians, int]:
     """Return the Gaussians of a field in its own frame, and the degree of its bands."""
 
     def values(name: str, width: int) -> np.ndarray | None:
-        for each in (name, f"{name}h"):  # of half floats
+        for each in (name, f"{name}h"):  # the second holds half floats
             attribute = prim.GetAttribute(each)
             if attribute and (content := attribute.Get()) is not None and len(content):
                 return np.array(content, np.float64).reshape(-1, width)
@@ -80,7 +80,7 @@ def _gaussians(prim: Any) -> tuple[Gaussians, int]:
 
     def of_each(name: str, width: int, rows: int, default: list[float]) -> np.ndarray:
         found = values(name, width)
-        if found is None or len(found) < rows:  # as the schemas say
+        if found is None or len(found) < rows:  # the schemas say so
             return np.tile(np.array(default), (rows, 1))
         return found[:rows]
 

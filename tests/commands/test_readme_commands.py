@@ -65,6 +65,7 @@ ELSEWHERE = {
     "beags extract --load-config C [--object NAME ...] [--remove]": "a line of it is run",
     "beags render --load-config C [--object NAME ...] [--format before-after]": "a line of it is run",
     "ns-viewer --load-config C": "a line of it is run",
+    "beags clean SCENE --data X": "refines a whole scene; test_clean_command.py runs it",
     "beags process --data PHOTOS_OR_VIDEO --output-dir X": "this scene has no texture; test_process.py runs it",
     "beags bench ablation [--data X ...]": "trains for minutes; test_bench_running.py runs experiments to their tables",
     "beags bench paper --data-root ROOT [--plan]": "needs the paper's data; test_paper_bench.py runs it on small trees",

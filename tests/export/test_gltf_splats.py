@@ -67,6 +67,15 @@ def values(content: dict[str, Any], binary: bytes, number: int) -> np.ndarray:
     return found.reshape(accessor["count"], width)
 
 
+def written_as(path: Path, kind: str) -> Path:
+    """Write a scene of "splats", or a closed box of "both"; returns the path."""
+    if kind == "splats":
+        write_scene(path)
+    else:
+        make_exporter("gltf-both", resolution=48, texture="none").write(path, a_closed_item())
+    return path
+
+
 def changed(path: Path, change) -> Path:
     """Write a .glb with another JSON, which ``change`` returns or changes."""
     content, binary = content_of(path)
@@ -229,11 +238,7 @@ def test_what_cannot_be_read_or_written(tmp_path):
 @pytest.mark.parametrize("kind", ["splats", "both"])
 def test_the_validator_finds_nothing_but_that_it_does_not_know_the_extension(tmp_path, kind):
     """2.0.0-dev.3.10 is older than the extension. With the extension's names hidden from it, it finds nothing."""
-    path = tmp_path / "scene.glb"
-    if kind == "splats":
-        write_scene(path)
-    else:
-        make_exporter("gltf-both", resolution=48, texture="none").write(path, a_closed_item())
+    path = written_as(tmp_path / "scene.glb", kind)
     content, binary = content_of(path)
     unknown = {("UNSUPPORTED_EXTENSION", "/extensionsUsed/0")}
     for mesh, entry in enumerate(content["meshes"]):
@@ -295,11 +300,7 @@ _LOADED = """
 @READ_BY_THREE
 @pytest.mark.parametrize("kind", ["splats", "both"])
 def test_the_loader_of_three_js_reads_it(tmp_path, kind):
-    path = tmp_path / "scene.glb"
-    if kind == "splats":
-        write_scene(path)
-    else:
-        make_exporter("gltf-both", resolution=48, texture="none").write(path, a_closed_item())
+    path = written_as(tmp_path / "scene.glb", kind)
     program = (
         """
         const fs = await import("fs");

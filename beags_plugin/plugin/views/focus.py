@@ -27,7 +27,7 @@ PIXELS = 0.8
 """Of a step with a close-up, in units of those of a whole photo: it shows more Gaussians a pixel, which take time."""
 LEAST_GAIN = 1.2
 """Factor by which close-ups show objects larger than whole photos do, below which they are not worth their steps."""
-MARGIN = 0.1  # of an object's longer side, on each of its four sides
+MARGIN = 0.1  # space on each side of an object, over its longer side
 LEAST_PART = 0.05  # of an object's pixels; smaller parts of its mask are taken for errors
 CLOSE = 1.25  # Boxes become one where that has at most this many times their pixels.
 LEAST_SIDE = 32  # pixels of a close-up's side; SSIM's window has 11

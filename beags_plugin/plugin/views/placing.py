@@ -125,7 +125,7 @@ def place(
         below = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
         original = matrix @ torch.cat([applied_matrix, below])
         if not (far or shifted):
-            original = original.float().double()  # as nerfstudio saves it
+            original = original.float().double()  # nerfstudio saves it so
     amid = None
     if far:
         amid = origin

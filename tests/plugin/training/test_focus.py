@@ -23,7 +23,7 @@ def focused(shared):
     return shared("focused_run", train)
 
 
-@pytest.mark.parametrize(("step", "after"), [(20, True), (47, False)])  # in the base, and refining
+@pytest.mark.parametrize(("step", "after"), [(20, True), (47, False)])  # one in the base, one refining
 def test_a_killed_run_ends_as_the_whole_one(focused, tmp_path, monkeypatch, step, after):
     run = tmp_path / "run"
     interrupted(focused / "data", run, monkeypatch, lambda patch: kill_at(patch, step, after), **FOCUSED)

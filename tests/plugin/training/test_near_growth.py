@@ -48,7 +48,7 @@ def test_each_part_grows_within_its_bound():
         return int(sources.sum()), int((~sources).sum())
 
     assert grown(6, 4) == (4, 6) and grown(6, 7) == (7, 6) and grown(8, 4) == (4, 8)
-    assert grown(0, 0) == (8, 12)  # without bounds
+    assert grown(0, 0) == (8, 12)  # no bound acts
 
 
 def test_bounds_stay_near_those_without_close_ups():

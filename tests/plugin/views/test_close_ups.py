@@ -74,7 +74,7 @@ def test_a_step_sees_the_same_in_every_run_and_others_see_other_windows(tmp_path
     drawn = [one.close_ups.drawn(0, step) for step in range(200)]
     found = [each for each in drawn if each is not None]
     assert 70 < len(found) < 130
-    for step in (0, 7, 150):  # in any order, as a resumed run asks
+    for step in (0, 7, 150):  # a resumed run asks in any order
         first, second = drawn[step], other.close_ups.drawn(0, step)
         assert (first is None) == (second is None)
         if first is not None:
@@ -159,7 +159,7 @@ def test_specks_do_not_widen_a_close_up_and_a_few_pixels_get_one(tmp_path):
     data = focused(tmp_path, 1.0)
     by_photo = {each.photo: each.camera for each in data.close_ups.close_ups}
     assert (by_photo[0].width, by_photo[0].height) == (by_photo[2].width, by_photo[2].height)
-    assert (by_photo[1].width, by_photo[1].height) == (LEAST_SIDE, LEAST_SIDE)  # in the corner of its photo
+    assert (by_photo[1].width, by_photo[1].height) == (LEAST_SIDE, LEAST_SIDE)  # it lies in the corner of its photo
 
 
 def test_a_photo_without_a_mask_gets_one_from_the_others(tmp_path):

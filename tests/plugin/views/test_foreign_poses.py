@@ -272,7 +272,7 @@ def test_frames_may_give_a_part_of_their_cameras(tmp_path):
 
     def change(meta):
         meta["frames"].sort(key=lambda frame: frame["file_path"])
-        meta["frames"][1].update(fl_x=2 * FX)  # with pixels as they are in the file
+        meta["frames"][1].update(fl_x=2 * FX)  # its pixels are those of the file
         meta["frames"][2].update(cx=3.0, k1=0.02)
         meta["frames"][3].update(fl_x=20.0, fl_y=30.0)
 
