@@ -7,6 +7,7 @@ those of splat .ply files. An object that is closed has its closed mesh beside i
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -129,6 +130,18 @@ class UsdSplatsExporter(Exporter):
         convex = UsdPhysics.MeshCollisionAPI.Apply(shape.GetPrim())
         convex.CreateApproximationAttr(UsdPhysics.Tokens.convexDecomposition)
 
+    def _write_whole(
+        self, path: Path, item: ExportItem, name: str, content_of: Callable[[Path], bytes]
+    ) -> dict[str, Any]:
+        """Write to ``path`` what ``content_of`` makes of a layer called ``name``; return its facts."""
+        with tempfile.TemporaryDirectory() as folder:
+            layer = Path(folder) / name
+            facts = self._write_layer(layer, item)
+            content = content_of(layer)
+        with whole_file(path) as part:
+            part.write_bytes(content)
+        return facts
+
 
 @dataclass(frozen=True)
 class UsdzSplatsExporter(UsdSplatsExporter):
@@ -137,13 +150,7 @@ class UsdzSplatsExporter(UsdSplatsExporter):
     suffix: ClassVar[str] = "splats.usdz"
 
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
-        with tempfile.TemporaryDirectory() as folder:
-            layer = Path(folder) / "splats.usdc"
-            facts = self._write_layer(layer, item)
-            content = packed(layer)
-        with whole_file(path) as part:
-            part.write_bytes(content)
-        return facts
+        return self._write_whole(path, item, "splats.usdc", packed)
 
 
 @dataclass(frozen=True)
@@ -153,13 +160,7 @@ class UsdaSplatsExporter(UsdSplatsExporter):
     suffix: ClassVar[str] = "splats.usda"
 
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
-        with tempfile.TemporaryDirectory() as folder:
-            layer = Path(folder) / "splats.usda"
-            facts = self._write_layer(layer, item)
-            content = layer.read_bytes()
-        with whole_file(path) as part:
-            part.write_bytes(content)
-        return facts
+        return self._write_whole(path, item, "splats.usda", Path.read_bytes)
 
 
 def _collider(item: ExportItem, options: MeshOptions) -> tuple[Closed | None, str]:
