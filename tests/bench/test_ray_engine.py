@@ -212,7 +212,7 @@ def test_without_ray_or_its_cluster_there_is_one_sentence(tmp_path, monkeypatch)
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "ray" else find(name))
     options = ExperimentOptions(output=tmp_path / "out", engine="ray")
-    with pytest.raises(UserError, match=r"the engine ray needs Ray: pip install 'beags\[ray\]'\."):
+    with pytest.raises(UserError, match=r"the engine ray needs Ray: pip install 'ray>=2\.50'\."):
         run_experiment(written(tmp_path, GOOD), options)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if name == "ray" else find(name))
 
