@@ -105,7 +105,6 @@ TABLES: tuple[PageTable, ...] = (
             "base: no wider limits far away",
             "base: free space not cleared",
             "base: large Gaussians go",
-            "base: colours decay",
             "base: no normal consistency",
             "base: with distortion",
         ),

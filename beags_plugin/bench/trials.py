@@ -36,13 +36,13 @@ class Trial:
     @cached_property
     def digest(self) -> str:
         """Return a digest that trials share if their results are equal; given data that were moved count as others."""
-        from beags_plugin.plugin.presets import preset_folder
+        from beags_plugin.plugin.presets import preset_files
 
         return value_digest(
             {
                 "scene": self.scene.digest,
                 "downscale": self.scene.downscale,
-                "preset": (preset_folder() / f"{self.preset}.toml").read_text("utf8"),
+                "preset": [path.read_text("utf8") for path in preset_files(self.preset)],
                 "overrides": {key: repr(value) for key, value in self.overrides.items()},  # repr: JSON has no infinity
                 "seed": self.seed,
                 "code": self.code,

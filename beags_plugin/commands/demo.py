@@ -108,9 +108,10 @@ def check_preset(preset: str) -> None:
 
 def _digest(scene: MadeScene, output: Path, preset: str) -> str:
     """Return what changes with the preset, the package's code and any file of the data (by name, size and time)."""
-    from beags_plugin.plugin.presets import preset_folder
+    from beags_plugin.plugin.presets import preset_files
 
-    return value_digest([*scene.digests(output), code_digest(), (preset_folder() / f"{preset}.toml").read_text("utf8")])
+    texts = [path.read_text("utf8") for path in preset_files(preset)]
+    return value_digest([*scene.digests(output), code_digest(), *texts])
 
 
 def write_stamp(output: Path, content: dict[str, Any]) -> None:

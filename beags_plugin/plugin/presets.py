@@ -43,18 +43,38 @@ def preset_names() -> list[str]:
 def load_preset(name: str, folder: Path | None = None) -> MethodSpecification:
     """Return the method of ``<folder>/<name>.toml``.
 
-    The file has a ``description`` and a table ``[overrides]`` of dotted config keys. Raises ``UserError`` for a file
-    that cannot be read and for a key that the base config does not have.
+    The file has a ``description``, a table ``[overrides]`` of dotted config keys, and with ``like`` the name of the
+    preset whose overrides come before its own. Raises ``UserError`` for a file that cannot be read, for a key that the
+    base config does not have, and for presets that are like each other.
     """
-    path = (folder or preset_folder()) / f"{name}.toml"
-    content = read_toml(path, "preset")
-    if unknown := set(content) - {"description", "overrides"}:
-        raise UserError(f"the preset {path} has unknown entries {sorted(unknown)}: only description and overrides.")
+    files = preset_files(name, folder)
     config = base_config()
     config.method_name = name
-    for key, value in content.get("overrides", {}).items():
-        override(config, key, value, path)
-    return MethodSpecification(config=config, description=_description(name, content["description"]))
+    for path in reversed(files):
+        for key, value in _read(path).get("overrides", {}).items():
+            override(config, key, value, path)
+    return MethodSpecification(config=config, description=_description(name, _read(files[0])["description"]))
+
+
+def preset_files(name: str, folder: Path | None = None) -> list[Path]:
+    """Return the files that decide a preset: its own, that of the preset it is like, and so on."""
+    files: list[Path] = []
+    while name:
+        path = (folder or preset_folder()) / f"{name}.toml"
+        if path in files:
+            raise UserError(f"the preset {files[0]} is like itself by way of {files[-1]}: take a like away.")
+        files.append(path)
+        name = _read(path).get("like", "")
+    return files
+
+
+def _read(path: Path) -> dict[str, Any]:
+    content = read_toml(path, "preset")
+    if unknown := set(content) - {"description", "like", "overrides"}:
+        raise UserError(
+            f"the preset {path} has unknown entries {sorted(unknown)}: only description, like and overrides."
+        )
+    return content
 
 
 def _description(name: str, sentence: str) -> str:

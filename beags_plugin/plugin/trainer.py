@@ -202,7 +202,6 @@ class BeagsTrainer(Trainer):
             str(self.config.method_name),
             self.config.max_num_iterations,
             chosen=self._start_step == 0,
-            small=self.config.model_config.pyramid.factor(self._start_step, self.schedule) > 1.0,
         )
         remove_unfinished(self.base_dir)
         (self.base_dir / REPORT_FILE).unlink(missing_ok=True)  # it marks the run as complete

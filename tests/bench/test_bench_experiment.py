@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from places import ROOT
 
 pytest.importorskip("nerfstudio")
 
@@ -27,11 +26,6 @@ def experiment(tmp_path):
 WITH_QUALITY = [name for name in experiment_names() if name != "classes"]  # which measures cost alone
 # experiments whose figures are reported; by all others something is chosen
 REPORTING = {"presets", "compare", "compare-consistent"}
-BENCHMARKS = {path.stem: path for path in sorted((ROOT / "benchmarks").glob("*.toml"))}
-REPORTING_BENCHMARKS = {
-    "comparison-more", "official-base", "photo-size", "presets-tiny", "presets-whole",
-    "time-to-quality",
-}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", WITH_QUALITY)
@@ -43,25 +37,7 @@ def test_scenes_for_choosing_and_for_reporting_are_kept_apart(name):
     assert not set(SEEDS["choosing"]) & set(SEEDS["reporting"]) and experiment.variants
 
 
-@pytest.mark.parametrize("name", BENCHMARKS)
-def test_files_of_benchmarks_keep_them_apart_too(name):
-    experiment = load_experiment(str(BENCHMARKS[name]))
-    seeds = {seed for _, seed in experiment.samples}
-    assert seeds and seeds <= set(SEEDS["reporting" if name in REPORTING_BENCHMARKS else "choosing"])
-    if name in {"base", "photo-size", "presets-tiny", "presets-whole", "time-to-quality"}:
-        assert {family for family, _ in experiment.samples} == {"tabletop", "room"}
-
-
-@pytest.mark.parametrize(
-    ("name", "count"),
-    [
-        ("presets", 3),
-        ("compare", 2),
-        (str(ROOT / "benchmarks/presets-whole.toml"), 1),
-        (str(ROOT / "benchmarks/photo-size.toml"), 1),
-        (str(ROOT / "benchmarks/presets-tiny.toml"), 1),
-    ],
-)
+@pytest.mark.parametrize(("name", "count"), [("presets", 3), ("compare", 2)])
 def test_rows_named_after_presets_refine_as_these_do(name, count):
     """All of a file from one base; k of the paper's is scaled to the pixels."""
     experiment = load_experiment(name)
@@ -74,37 +50,11 @@ def test_rows_named_after_presets_refine_as_these_do(name, count):
         )
         if row.name == "beags-paper":
             preset = replace(preset, prepare=replace(preset.prepare, k_pixels=own.prepare.k_pixels))
-        base = {"base_steps", "base_lr_factor", "densify", "sh_decay", "exposure"}
+        base = {"base_steps", "base_lr_factor", "densify", "exposure"}
         assert {key for key, value in vars(own).items() if value != getattr(preset, key)} <= base, row.name
 
 
-@pytest.mark.parametrize(
-    ("file", "rows"),
-    [
-        ("benchmarks/time-to-quality.toml", {"beags": "beags", "beags-fast": "beags-fast"}),
-        ("benchmarks/official-base.toml", {f"base of {name}, refined": name for name in ("beags", "beags-fast")}),
-        ("benchmarks/presets-whole.toml", {"beags": "beags"}),
-        ("benchmarks/photo-size.toml", {"beags": "beags"}),
-        ("benchmarks/presets-tiny.toml", {"beags-tiny": "beags-tiny"}),
-        ("benchmarks/shorter-bases.toml", {"7,500 steps, colours decay": "beags", "rates x 2": "beags-fast"}),
-    ],
-)
-def test_rows_of_the_bases_of_presets_train_these(file, rows):
-    experiment = load_experiment(str(ROOT / file))
-    variants = {variant.name: variant.base for variant in experiment.variants}
-    for row, name in rows.items():
-        own, preset = (
-            preset_config(name, overrides, Path()).model_config
-            for name, overrides in ((experiment.preset, variants[row]), (name, {}))
-        )
-        refinement = {"refine_steps", "losses", "close_contacts"}
-        assert {key for key, value in vars(own).items() if value != getattr(preset, key)} <= refinement, row
-
-
-WITH_CONTROLS = [str(BENCHMARKS[name]) for name in ("photo-size", "presets-tiny", "presets-whole")]
-
-
-@pytest.mark.parametrize("name", [*WITH_QUALITY, *WITH_CONTROLS])
+@pytest.mark.parametrize("name", WITH_QUALITY)
 def test_every_length_of_refinement_has_its_control(name):
     """A gain in PSNR is one over as many steps with no loss of masks."""
     lengths: dict[bool, set[int]] = {True: set(), False: set()}

@@ -14,7 +14,7 @@ from beags_plugin.bench.provenance import command
     [
         (None, "beags"),
         ("beags_plugin.commands.cli", "beags"),
-        ("benchmarks.time_to_quality", "python -m benchmarks.time_to_quality"),
+        ("benchmarks.page_tables", "python -m benchmarks.page_tables"),
         ("benchmarks.__main__", "python -m benchmarks"),
     ],
 )

@@ -62,9 +62,6 @@ mistakes(
         "several processes on a CPU": trained("--machine.num-devices", "2"),
         "no process": trained("--machine.num-devices", "0"),
         "a learning rate that is not a number": trained("--pipeline.model.position-lr", "nan", "nan"),
-        "a decay that is not a number": model("sh-decay", "nan"),
-        "a negative decay": model("sh-decay", "-0.4"),
-        "a decay that takes all away": model("sh-decay", "8000"),
     },
 )
 

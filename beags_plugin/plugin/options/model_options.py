@@ -15,14 +15,11 @@ from tyro.conf import Suppress
 from beags_plugin.core.densification import DensifyConfig
 from beags_plugin.core.sh import MAX_DEGREE
 from beags_plugin.plugin.options.loss_spec import LossSpec
-from beags_plugin.plugin.options.pyramid import PyramidConfig
 from beags_plugin.plugin.options.schedule import PhaseSchedule
 from beags_plugin.preparation.pipeline import PreparationConfig
 from beags_plugin.refiners import make_refiner
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.registry import load
-
-MOST_DECAY = 100.0  # of colours by the view: an eightieth a step at the official rate
 
 
 @dataclass
@@ -72,8 +69,6 @@ class BeagsModelConfig(ModelConfig):
     """The terms of the training loss by name."""
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     """When and how the base grows and prunes its Gaussians."""
-    pyramid: PyramidConfig = field(default_factory=PyramidConfig)
-    """Small photos first, in the base."""
     prepare: PreparationConfig = field(default_factory=PreparationConfig)
     """Options of mask reprojection and of the voxel grids."""
     position_lr: Suppress[tuple[float, float]] = (1.6e-4, 1.6e-6)
@@ -81,10 +76,6 @@ class BeagsModelConfig(ModelConfig):
     base_lr_factor: float = 1.0
     """Factor of all learning rates of the base but that of opacities, for a base that is shorter than the official one;
     a base that polishes takes none."""
-    sh_decay: float = 0.0
-    """Weight decay of colours that depend on the view (AdamW's, of the coefficients of degrees 1 and up) in the base:
-    each step takes this times their learning rate of them away. With 0, as in the official code, they learn by heart
-    what photos differ in by chance. A base that polishes takes none. It is added to the group's own weight decay."""
     close_contacts: bool = False
     """After the last step of a refinement by losses: close objects, such as the lid of a box, where other objects hid
     them from every photo. It takes a second or more for each object."""
@@ -109,9 +100,6 @@ class BeagsModelConfig(ModelConfig):
             raise UserError(f"position_lr is {self.position_lr}: give two learning rates above 0.")
         if not 0 < self.base_lr_factor < math.inf:
             raise UserError(f"base_lr_factor is {self.base_lr_factor}: give a factor above 0.")
-        if not 0 <= self.sh_decay <= MOST_DECAY:
-            raise UserError(f"sh_decay is {self.sh_decay}: give a number from 0 (no decay) to {MOST_DECAY}.")
-        self.pyramid.check()
         make_refiner(self.refiner, self.refiner_options)
 
     def schedule(self) -> PhaseSchedule:

@@ -9,7 +9,6 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from torch.optim import Adam
 
 from beags_plugin.core.cameras import camera_extent
-from beags_plugin.plugin.options.pyramid import small_size
 from beags_plugin.plugin.options.schedule import log_linear
 from beags_plugin.plugin.training.densifier import Densifier
 from beags_plugin.plugin.training.exposure import exposures_of_run
@@ -32,7 +31,6 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
     adam = cast(SceneOptimizer, attributes.optimizers).adam
     model.seed = trainer.config.machine.seed
     model.extent = camera_extent(datamanager.train_dataset.cameras.camera_to_worlds).to(model.device)
-    shrink(model, datamanager)
     focus(model, datamanager)
     densifier = Densifier(model, adam, datamanager)
     switch = RefinementSwitch(model, trainer, datamanager)
@@ -82,16 +80,6 @@ def focus(model: SceneModel, datamanager: BeagsDataManager) -> None:
         model.schedule = replace(model.schedule, sharpened=SHARPENED)
 
 
-def shrink(model: SceneModel, datamanager: BeagsDataManager) -> None:
-    """Have the data manager give the sizes of the model's pyramid."""
-    pyramid = model.config.pyramid
-
-    def size_at(step: int, width: int, height: int) -> tuple[int, int]:
-        return small_size(width, height, pyramid.factor(step, model.schedule))
-
-    datamanager.shrink(size_at if pyramid.start > 1.0 else None)
-
-
 def _curves(model: SceneModel, trainer: TrainingRun, datamanager: BeagsDataManager) -> Curves | None:
     """Return the writer of this run's curves; None where nobody would read them."""
     config = trainer.config
@@ -117,8 +105,6 @@ def set_learning_rates(model: SceneModel, adam: Adam, configs: dict[str, Any], s
     for group in adam.param_groups:
         options = configs[group["name"]]["optimizer"]
         rate, group["weight_decay"], group["eps"] = options.lr, options.weight_decay, options.eps
-        if group["name"] == "features_rest" and from_seeds:
-            group["weight_decay"] += model.config.sh_decay
         if group["name"] == "means":
             rate = log_linear(*model.config.position_lr, progress) * model.extent_on_host()
         group["lr"] = rate if group["name"] == "opacities" else rate * faster

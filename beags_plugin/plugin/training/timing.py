@@ -16,13 +16,11 @@ ESTIMATE_STEPS = (20, 120)  # the estimate is the mean step between these, after
 class Estimate:
     """The expected time of ``steps`` steps of a method, printed once.
 
-    chosen: the method was chosen for this run, as not in a resumed one; a quicker one is named then. small: its first
-    steps see small photos.
+    chosen: the method was chosen for this run, as not in a resumed one; a quicker one is named then.
     """
 
-    def __init__(self, method: str, steps: int, chosen: bool = True, small: bool = False) -> None:
+    def __init__(self, method: str, steps: int, chosen: bool = True) -> None:
         self._steps = steps
-        self._slower = "as Gaussians are added" + (" and photos grow" if small else "")
         self._quicker = f" {QUICKER}" if chosen and method != QUICKEST else ""
         self._from = 0.0
         CONSOLE.print(
@@ -42,7 +40,7 @@ class Estimate:
         left = self._steps * seconds_per_step
         message = (
             f"About {_duration(left)} for {self._steps} steps at the present speed "
-            f"({1000 * seconds_per_step:.0f} ms a step; it slows down {self._slower})."
+            f"({1000 * seconds_per_step:.0f} ms a step; it slows down as Gaussians are added)."
         )
         if left > LONG_RUN_SECONDS:
             message += self._quicker

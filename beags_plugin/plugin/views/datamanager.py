@@ -30,7 +30,6 @@ from beags_plugin.plugin.views.dense_seeds import MOST_PHOTOS, with_dense_seeds
 from beags_plugin.plugin.views.focus import aim_by, focused
 from beags_plugin.plugin.views.objects_alone import objects_alone
 from beags_plugin.plugin.views.photo_files import PhotoFiles
-from beags_plugin.plugin.views.small_views import SizeAt, SmallViews
 from beags_plugin.plugin.views.streaming import Lazy, StreamedViews
 from beags_plugin.plugin.views.views import View, unique_names
 from beags_plugin.system import processes
@@ -88,7 +87,6 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         }  # fmt: skip
         self.train_cameras = self.train_dataset.cameras.to(self.device)
         self._cameras: dict[int, Camera] = {}
-        self._small = SmallViews(keep=not isinstance(self.cached_train, StreamedViews))
         self.close_ups: CloseUps | None = None  # that training sees, once ``focus`` was called
         self._present: list[list[int]] | None = None  # objects of each training view's labels, once they are replaced
         # nerfstudio samples evaluation views by Python's global generator, which others use too.
@@ -167,23 +165,14 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             data.setdefault("present", self._present[index])
         return camera, data
 
-    def shrink(self, size_at: SizeAt | None) -> None:
-        """Train on photos of the sizes of ``size_at`` from here on; None: on whole ones."""
-        self._small.shrink(size_at)
-
-    def training_camera(self, index: int, step: int) -> Camera:
-        """Return the camera of a training view as ``step`` would see it."""
-        return self._small.camera(index, self._camera(index), step)
-
     def _seen(self, index: int, held: dict, step: int) -> tuple[Camera, dict]:
         """Return camera and batch that ``step`` sees of a view whose data are ``held`` in the cache."""
         if self.close_ups is not None and (drawn := self.close_ups.drawn(index, step)) is not None:
             camera, data = drawn
             present = {} if self._present is None else {"present": objects_in(to_int32(data["labels"]))}
             data = self._as_wanted({**data, **present, "image": data["image"].to(self.device)})
-            return self._small.once(camera.to(self.device), data, step)
-        data = self._small.batch(index, self._camera(index), self._as_wanted(held), step)
-        return self.training_camera(index, step), data
+            return camera.to(self.device), data
+        return self._camera(index), self._as_wanted(held)
 
     def _as_wanted(self, held: dict) -> dict:
         """Return data on the device, of all that the photo shows or of its objects."""

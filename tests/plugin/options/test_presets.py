@@ -13,7 +13,7 @@ pytest.importorskip("nerfstudio")
 from beags_plugin.losses import LOSSES
 from beags_plugin.plugin import methods
 from beags_plugin.plugin.options.config import BeagsTrainerConfig, base_config
-from beags_plugin.plugin.presets import load_preset, override, preset_folder, preset_names
+from beags_plugin.plugin.presets import load_preset, override, preset_files, preset_folder, preset_names
 from beags_plugin.refiners import REFINERS
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.shipped import read_toml
@@ -80,13 +80,25 @@ def test_entry_points_give_the_presets():
 def test_the_presets_of_one_phase_are_that_phase_of_beags():
     """The options of beags-base and beags-refine together are those of beags."""
 
-    def overrides(name):
-        kept = read_toml(preset_folder() / f"{name}.toml", "preset")["overrides"]
-        return {key.removeprefix("pipeline.model."): value for key, value in kept.items()}
+    whole, base, refine = (load_preset(name).config.pipeline.model for name in ("beags", "beags-base", "beags-refine"))
+    assert base == replace(whole, refine_steps=0) and refine == replace(whole, base_steps=0)
 
-    whole, base, refine = map(overrides, ("beags", "beags-base", "beags-refine"))
-    assert base["refine_steps"] == 0 and refine["base_steps"] == 0
-    assert {**refine, **base, "refine_steps": refine["refine_steps"]} == whole
+
+def test_a_preset_takes_the_overrides_of_the_one_it_is_like(tmp_path):
+    texts = {
+        "first": "[overrides]\n'pipeline.model.base_steps' = 7\n'pipeline.model.refine_steps' = 8",
+        "second": "like='first'\n[overrides]\n'pipeline.model.refine_steps' = 9",
+        "third": "like='second'",
+    }
+    for name, text in texts.items():
+        (tmp_path / f"{name}.toml").write_text(f"description='{name}'\n{text}")
+    spec = load_preset("third", tmp_path)
+    assert (spec.config.method_name, spec.description.split()[0]) == ("third", "third")
+    assert (spec.config.pipeline.model.base_steps, spec.config.pipeline.model.refine_steps) == (7, 9)
+    assert [path.stem for path in preset_files("third", tmp_path)] == ["third", "second", "first"]
+    (tmp_path / "first.toml").write_text("description='x'\nlike='third'")
+    with pytest.raises(UserError, match="is like itself by way of .*first.toml: take a like away"):
+        load_preset("third", tmp_path)
 
 
 def test_presets_do_not_share_state():
@@ -103,6 +115,7 @@ def test_presets_do_not_share_state():
         ('description="x"\n[overrides]\n"pipeline.model.base_steps" = "many"', "must be int"),
         ('description="x"\nextra=1', "unknown entries"),
         ("description=", "is no TOML"),
+        ('description="x"\nlike="nobody"', "nobody.toml cannot be read"),
     ],
 )
 def test_a_wrong_preset_is_refused_in_one_sentence(tmp_path, text, words):

@@ -10,27 +10,17 @@ import torch
 
 pytest.importorskip("nerfstudio")
 
-from resumed_runs import STEPS, Killed, assert_same_run, interrupted, kill_at, resume_to_end, run_to_end
+from resumed_runs import Killed, assert_same_run, interrupted, kill_at, resume_to_end, run_to_end
 from resumed_runs import short_config as usual_config
 from run_folders import write_scene
 
-from beags_plugin.plugin.options import pyramid
 from beags_plugin.plugin.training import densifier
 from beags_plugin.system.reading.ply import write_vertices
 
 SHORT = {
-    "pipeline.model.pyramid.start": 3.0,
-    "pipeline.model.pyramid.until": 0.8,
-    "pipeline.model.pyramid.levels": 3,
     "pipeline.model.base_lr_factor": 3.0,
-    "pipeline.model.sh_decay": 1.2,
     "pipeline.model.densify.free_share": 0.7,
 }
-
-
-@pytest.fixture(autouse=True)
-def tiny_photos(monkeypatch):
-    monkeypatch.setattr(pyramid, "LEAST_SIDE", 4)  # the photos of these runs are tiny
 
 
 @pytest.fixture
@@ -39,24 +29,8 @@ def data(short_run):
 
 
 def test_a_base_of_all_means_is_resumed_bit_for_bit(data, tmp_path, monkeypatch):
-    from beags_plugin.plugin.model import BeagsModel
-
-    sizes, outputs = [], BeagsModel._training_outputs
-
-    def seen(self, cameras):
-        sizes.append((self.step, cameras.metadata["camera"].width, int(cameras.width)))
-        found = outputs(self, cameras)
-        assert found["rgb"].shape[1] == sizes[-1][1]
-        return found
-
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    with monkeypatch.context() as patch:
-        patch.setattr(BeagsModel, "_training_outputs", seen)
-        run_to_end(usual_config(data, whole, **SHORT))
-    own, cameras = zip(*((a, b) for _, a, b in sizes), strict=True)
-    assert own == cameras and list(own) == sorted(own) and len(set(own)) == 4
-    last = max(step for step, width, _ in sizes if width < own[-1])
-    assert last == 0.8 * STEPS[0] - 1, last  # and refinement sees whole photos
+    run_to_end(usual_config(data, whole, **SHORT))
     interrupted(data, killed, monkeypatch, lambda patch: kill_at(patch, 17), **SHORT)
     for step in (33, 44):
         with monkeypatch.context() as patch:
