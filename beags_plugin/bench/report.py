@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
 
+LINE = 4_000  # characters of a row of JSON that stays one line
 _LOGARITHMIC = 20.0  # above it, a linear axis would crowd small values at one end
 
 
@@ -33,8 +34,23 @@ def provenance() -> dict[str, Any]:
 
 
 def write_json(path: Path, report: Mapping[str, Any]) -> None:
-    """Write the report, and make its folder."""
-    write_text_atomically(json.dumps(report, indent=1, allow_nan=False) + "\n", path)
+    """Write the report, a row on a line, and make its folder."""
+    write_text_atomically(_json_lines(report, "") + "\n", path)
+
+
+def _json_lines(value: Any, indent: str) -> str:
+    """Return JSON in which each row of a list is one line, if it fits in ``LINE`` characters."""
+    line = json.dumps(value, allow_nan=False)
+    rows = isinstance(value, list | tuple) and any(isinstance(each, Mapping) for each in value)
+    if not isinstance(value, Mapping | list | tuple) or (indent and not rows and len(line) <= LINE):
+        return line
+    inner = indent + " "
+    if isinstance(value, Mapping):
+        parts = [f"{json.dumps(str(key))}: {_json_lines(each, inner)}" for key, each in value.items()]
+    else:
+        parts = [_json_lines(each, inner) for each in value]
+    first, last = "{}" if isinstance(value, Mapping) else "[]"
+    return f"{first}\n" + ",\n".join(inner + part for part in parts) + f"\n{indent}{last}"
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -119,7 +119,12 @@ def test_json_and_csv_hold_every_row_and_the_same_figures(rows, tmp_path, experi
     report = report_json(experiment, rows, {"commit": "abc", "quick": False})
     write_json(tmp_path / "deep/r.json", report)
     write_csv(tmp_path / "deep/r.csv", table_rows(rows))
-    read = json.loads((tmp_path / "deep/r.json").read_text())
+    text = (tmp_path / "deep/r.json").read_text()
+    read = json.loads(text)
+    assert [json.loads(line.rstrip(",")) for line in text.splitlines() if line.startswith("  {")] == [
+        *read["rows"],
+        *read["means"],
+    ]
     assert read["experiment"] == "mine" and read["commit"] == "abc" and read["paper"] is None
     assert read["protocol"] == protocol_of(rows)
     assert all(set(row) == set(COLUMNS) for row in read["rows"])
