@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import TAU
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
 
-TAU = 0.02  # what is nearer than the object by more than this share of its depth hides it (as in E5)
 _INSIDE, _OUTSIDE, _HIDDEN, _BESIDE = range(4)
 
 

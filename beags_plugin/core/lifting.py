@@ -8,6 +8,8 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 
 MARGIN = 1.3
+TAU = 0.02
+"""Depths that differ by less than this share are of one surface; what is nearer by more hides (method, E5)."""
 
 
 def pixel_rays(camera: Camera, like: Tensor) -> Tensor:

@@ -8,13 +8,11 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import TAU
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.masks.reprojection import PixelMaps, landing
 from beags_plugin.preparation.consistent_masks import render_depths
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
-
-TAU = 0.02
-"""Greatest difference of a point's depth in a training view and that view's surface, as a share of the former (E5)."""
 
 
 def shown_pixels(

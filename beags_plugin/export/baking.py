@@ -11,13 +11,12 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.exposure import BRIGHT, DARK, even_exposures
-from beags_plugin.core.lifting import project
+from beags_plugin.core.lifting import TAU, project
 from beags_plugin.export.base import Photo
 from beags_plugin.export.color import linear_from_srgb, srgb_from_linear
 from beags_plugin.export.fusion import Mesh
 from beags_plugin.export.surface import in_voxels, surface_of
 
-HIDES = 0.02  # what is nearer than a place by more than this share of its depth hides it (as in E5)
 _OFF = 1.0  # voxels above the surface, where rays to the camera start
 FLATTEST = 0.2  # least cosine between normal and ray: flatter views smear
 _SHARPEN = 3  # the power of a view's weight: more follow the best view, fewer blur what views place differently
@@ -87,7 +86,7 @@ def places_seen(places: Places, mesh: Mesh, caster: Any, photo: Photo) -> tuple[
     column, row = np.floor(xy[index]).astype(np.int64).T
     column, row = np.minimum(column, camera.width - 1), np.minimum(row, camera.height - 1)
     depth = photo.depth().numpy()[row, column]
-    index = index[well_inside(photo.own())[row, column] & ~((depth > 0) & (depth < (1.0 - HIDES) * z[index]))]
+    index = index[well_inside(photo.own())[row, column] & ~((depth > 0) & (depth < (1.0 - TAU) * z[index]))]
     index = index[~_hidden(caster, mesh, places[index], camera.center.double().numpy())]
     light = linear_from_srgb(interpolated(photo.image(), xy[index]))
     pixels = cosine[index] * (camera.focal * places.spacing / z[index]) ** 2  # for the area of a place

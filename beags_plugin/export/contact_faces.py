@@ -12,13 +12,12 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.lifting import project
+from beags_plugin.core.lifting import TAU, project
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import ExportItem, Viewpoints
 from beags_plugin.export.closing_surfels import closing_gaussians, joined
-from beags_plugin.export.fusion import TAU
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.extraction.select import select_class
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE

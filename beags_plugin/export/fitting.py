@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from beags_plugin.core.lifting import TAU
 from beags_plugin.export.atlas import Atlas
-from beags_plugin.export.baking import FLATTEST, HIDES, well_inside
+from beags_plugin.export.baking import FLATTEST, well_inside
 from beags_plugin.export.base import Photo
 from beags_plugin.export.color import linear_from_srgb, srgb_from_linear
 from beags_plugin.export.fusion import Mesh
@@ -97,7 +98,7 @@ def _pixels(
     depth, normals = hit["t_hit"].numpy(), hit["primitive_normals"].numpy()
     cosine = -np.einsum("pd,pd->p", normals, ways) / np.linalg.norm(ways, axis=1)
     scene = np.repeat(photo.depth().numpy()[rows, cols], len(_RAYS))
-    good = np.isfinite(depth) & (cosine > FLATTEST) & ~((scene > 0) & (scene < (1.0 - HIDES) * depth))
+    good = np.isfinite(depth) & (cosine > FLATTEST) & ~((scene > 0) & (scene < (1.0 - TAU) * depth))
     whole = good.reshape(-1, len(_RAYS)).all(axis=1)
     rays_of = np.repeat(whole, len(_RAYS))
     face = hit["primitive_ids"].numpy()[rays_of].astype(np.int64)

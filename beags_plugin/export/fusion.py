@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.lifting import lift
+from beags_plugin.core.lifting import TAU, lift
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import Viewpoints
 from beags_plugin.export.close_up import close_up
@@ -28,7 +28,6 @@ PIXELS_PER_VOXEL = 2
 """Of the renders: discs smaller than a pixel are rendered a pixel wide, on slanted surfaces too near."""
 _VOXEL_BYTES = 20  # distance, weight and three colours, float32 each
 _STRIDE = 4  # pixels between those at which Open3D looks for blocks
-TAU = 0.02  # share of a depth by which depths may err
 _SOLID = 0.5  # the median depth exists where more light than this is stopped
 
 

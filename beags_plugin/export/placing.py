@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from beags_plugin.core.lifting import project
-from beags_plugin.export.baking import HIDES, Places, exposures_of, interpolated, places_seen
+from beags_plugin.core.lifting import TAU, project
+from beags_plugin.export.baking import Places, exposures_of, interpolated, places_seen
 from beags_plugin.export.base import Photo
 from beags_plugin.export.color import linear_from_srgb
 from beags_plugin.export.fusion import Mesh
@@ -84,7 +84,7 @@ def outline_iou(mesh: Mesh, photos: Sequence[Photo], progress: Callable[[int], N
         rays, _ = rays_through(mesh, camera, np.stack([columns, rows], axis=1) + 0.5)
         hit = caster.cast_rays(rays)["t_hit"].numpy()
         mine, scene = own[rows, columns], depth[rows, columns]
-        hidden = ~mine & (scene > 0) & (scene < (1.0 - HIDES) * hit)
+        hidden = ~mine & (scene > 0) & (scene < (1.0 - TAU) * hit)
         shown = np.isfinite(hit) & ~hidden
         both, either = both + int((shown & mine).sum()), either + int((shown | mine).sum())
         progress(done)

@@ -14,7 +14,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from beags_plugin.core.lifting import lift
+from beags_plugin.core.lifting import TAU, lift
 from beags_plugin.labels.borders import at_border
 from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.losses.base import Loss, LossInputs
@@ -22,9 +22,6 @@ from beags_plugin.losses.class_members import ClassMembers
 from beags_plugin.losses.reduction import ordered_sum
 from beags_plugin.rasterizers.rendering import shape_inputs
 from beags_plugin.system.errors import UserError
-
-TAU = 0.02
-"""The object is hidden where its depth z and the scene's D have z > (1 + TAU) D; as in reprojection (E5)."""
 
 EDGE = 3
 """Voxels of the 27 around a point that a plane fills which ends one voxel before it; up to its edge it fills 6."""

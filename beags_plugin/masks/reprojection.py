@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import TAU
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import LabelMaps, to_int32
 from beags_plugin.ops import cuda_extension, extension
@@ -38,7 +39,7 @@ def reproject_pairwise(
     cameras: Sequence[Camera],
     labels: Sequence[Tensor | None],
     num_classes: int,
-    tau: float = 0.02,
+    tau: float = TAU,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[ReprojectedMask]:
     """Give every pixel of every view the class with the most votes by lifted pixels of all views (E5).

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import TAU
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.masks.depth_agreement import disagreement
 from beags_plugin.masks.pooled_votes import LOOKS, TorchVotes
@@ -27,7 +28,7 @@ def reproject_voxel(
     cameras: Sequence[Camera],
     labels: Sequence[Tensor | None],
     num_classes: int,
-    tau: float = 0.02,
+    tau: float = TAU,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[ReprojectedMask]:
     """Give every pixel of every view the class with the most votes by lifted pixels of all views near its point.

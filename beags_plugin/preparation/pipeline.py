@@ -13,6 +13,7 @@ from torch import Tensor
 from beags_plugin.assignment.assignment import Assignment, by_largest
 from beags_plugin.assignment.contributions import check_class_ids, contributions
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import TAU
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE, objects_in
@@ -46,7 +47,7 @@ class PreparationConfig:
     reprojection: str = AUTO
     """How the views' masks are made to agree: pairwise (exact), voxel (quick), auto (the one that fits the number of
     views), none (the masks stay as they are), or a registered one."""
-    tau: float = 0.02
+    tau: float = TAU
     """Of pairwise: a vote counts if its point is visible, |z - depth| <= tau z; inf counts every vote (E5)."""
     depth: str = "median"
     """Which depth is lifted: median or expected."""

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import TAU
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.evaluation.shown import TAU, shown_pixels
+from beags_plugin.evaluation.shown import shown_pixels
 from beags_plugin.rasterizers.interface import RasterSettings
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 40.0

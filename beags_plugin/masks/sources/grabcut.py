@@ -10,6 +10,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 
+from beags_plugin.core.lifting import TAU
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import LabelMaps
@@ -39,7 +40,7 @@ class GrabCutSource(MaskSource):
 
     prompts: Path = Path("prompts.json")
     rounds: int = 2
-    tau: float = 0.02
+    tau: float = TAU
     held_out: bool = False
 
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
