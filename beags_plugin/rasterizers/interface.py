@@ -11,6 +11,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.system.errors import UserError
 
 MIN_ALPHA = 1.0 / 255.0  # weaker contributions are skipped: they are invisible in 8 bits
 LARGEST = 1e18  # world units: surfels larger, or further off in depth, count as broken; their squares overflow float32
@@ -129,7 +130,9 @@ class RasterOutputs:
 class Rasterizer(ABC):
     """One backend. All its methods render surfels with the same weights w_i.
 
-    Instances hold no scene; they may be kept for the life of the program.
+    A backend writes the five abstract methods. Pixel counts, largest contributions and class channels are for some
+    refiners of other papers alone: without them these say which backend to take. Instances hold no scene; they may be
+    kept for the life of the program.
     """
 
     @classmethod
@@ -174,7 +177,6 @@ class Rasterizer(ABC):
             lambda slots, count: self.class_contributions(inputs, camera, settings, slots, count), labels, num_classes
         )
 
-    @abstractmethod
     def sparse_class_pixel_counts(
         self,
         inputs: SurfelInputs,
@@ -189,8 +191,8 @@ class Rasterizer(ABC):
         They are keys [M] int64 as in ``sparse_class_contributions``, and counts [M] int32. A hidden surfel counts too
         until compositing stops before it. No gradient.
         """
+        raise self._lacks("pixel counts")
 
-    @abstractmethod
     def sparse_top_contributions(
         self,
         inputs: SurfelInputs,
@@ -206,6 +208,7 @@ class Rasterizer(ABC):
         They are chosen, of equal ones the nearer, among the first ``within`` (at least 1, as ``most``) that the pixel
         has. No gradient.
         """
+        raise self._lacks("largest contributions")
 
     @abstractmethod
     def class_map(
@@ -217,7 +220,6 @@ class Rasterizer(ABC):
         gradient.
         """
 
-    @abstractmethod
     def class_channels(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
     ) -> Tensor:
@@ -226,6 +228,7 @@ class Rasterizer(ABC):
         A backend should take the same time for any number of classes if it can, as dL/dw_i is dL/dp at phi_i; else
         ``rendering.class_channels_by_threes`` does it.
         """
+        raise self._lacks("class channels")
 
     def feature_channels(
         self, inputs: SurfelInputs, features: Tensor, camera: Camera, settings: RasterSettings
@@ -239,6 +242,12 @@ class Rasterizer(ABC):
     @abstractmethod
     def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
         """Return [H, W] int32, the index of the surfel with the largest w_i (ties to the nearer); -1 where none is."""
+
+    def _lacks(self, what: str) -> UserError:
+        return UserError(
+            f"the rasterizer {type(self).__name__} has no {what}, which this refiner needs: train with "
+            "--pipeline.model.rasterizer native or torch."
+        )
 
 
 def sparse_table(table: Callable[[Tensor, int], Tensor], labels: Tensor, num_classes: int) -> tuple[Tensor, Tensor]:

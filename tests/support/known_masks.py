@@ -35,16 +35,7 @@ class Squares(Rasterizer):
     def class_contributions(self, inputs, camera, settings, labels, num_classes):
         raise NotImplementedError
 
-    def sparse_class_pixel_counts(self, inputs, camera, settings, labels, num_classes, min_weight=0.0):
-        raise NotImplementedError
-
-    def sparse_top_contributions(self, inputs, camera, settings, labels, num_classes, most, within):
-        raise NotImplementedError
-
     def class_map(self, inputs, camera, settings, num_classes):
-        raise NotImplementedError
-
-    def class_channels(self, inputs, camera, settings, num_classes):
         raise NotImplementedError
 
     def dominant_gaussian(self, inputs, camera, settings):
