@@ -26,7 +26,7 @@ from beags_plugin.export.surface import rays_through, surface_of
 
 _RAYS = 0.25 * np.array([[1.0, 1.0], [3.0, 1.0], [1.0, 3.0], [3.0, 3.0]])  # in a pixel
 _MOST = 1_000_000  # pixels of all photos that are looked at; each takes about 400 bytes
-_HOLD = 0.2  # pull to the mean, in photos' pixels (chosen on tabletop 0 and room 0: docs/export.md)
+_HOLD = 0.2  # pull to the mean, in photos' pixels (chosen on tabletop 0 and room 0: notes/export.md)
 _STEPS = 20  # of the solver: it sharpens the longer the more, noise too
 
 
