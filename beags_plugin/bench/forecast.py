@@ -14,7 +14,7 @@ from beags_plugin.bench.scenes import SceneSize
 from beags_plugin.bench.trials import Trial, VariantTrial
 
 BASE = "base"  # the kind of the trials that others start from
-TEMPORARY_BYTES = 18  # a training pixel between base and refinement: depth 4, lifted pixels 6, votes 8 (docs/data.md)
+TEMPORARY_BYTES = 18  # a training pixel between base and refinement: depth 4, lifted pixels 6, votes 8 (notes/poses.md)
 PROGRAM_MB = 1000.0  # of memory, for a trial of which nothing is known
 PIXEL_BYTES = 8  # and a training pixel of it: photos 3, masks 2, room for the rest
 

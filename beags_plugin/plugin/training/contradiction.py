@@ -17,7 +17,7 @@ from beags_plugin.rasterizers.rendering import surfel_inputs
 MOST_VIEWS = 24  # rendered to measure the residuals
 LIMIT_DB = 8.0
 """Difference of PSNR inside and outside the masks from which the photos are taken to contradict each other: that of the
-generated turntable is 12, those of five consistent scenes 2 at most (docs/training.md)."""
+generated turntable is 12, those of five consistent scenes 2 at most (notes/poses.md)."""
 
 
 @dataclass(frozen=True)
