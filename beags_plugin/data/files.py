@@ -26,6 +26,7 @@ def list_images(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     files = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
+    files = (path for path in files if not path.name.startswith("."))  # what macOS writes beside files of other disks
     return sorted(files, key=lambda path: path.name)
 
 
@@ -93,23 +94,27 @@ def width_note(folder: Path) -> str:
 
 
 def numbered(files: Sequence[Path], count: int) -> list[int] | None:
-    """Return which of ``count`` photos these are where some are missing, by the numbers from 0 that end their names.
+    """Return which of ``count`` photos these are where some are missing, by the numbers that end their names.
 
-    None where the names are not all such numbers: then nobody can tell which are missing.
+    The numbers count from 0, or the first and the last photo are there. None where nobody can tell which are missing.
     """
     ends = [re.search(r"\d+$", file.stem) for file in files]
     places = [int(end[0]) for end in ends if end is not None]
-    told = len(set(places)) == len(files) < count and all(place < count for place in places)
-    return places if told else None
+    if not len(set(places)) == len(files) < count:
+        return None
+    if all(place < count for place in places):
+        return places
+    first = min(places)
+    return [place - first for place in places] if max(places) - first == count - 1 else None
 
 
 def missing_numbers(files: Sequence[Path], places: Sequence[int], count: int) -> tuple[Path, ...]:
     """Return the photos of ``count`` that are missing beside ``files``, whose ``places`` are those of ``numbered``."""
     first = files[0]
-    digits = len(re.search(r"\d+$", first.stem)[0])  # type: ignore[index]
-    start = first.stem[:-digits]
+    number = re.search(r"\d+$", first.stem)[0]  # type: ignore[index]
+    start, shift = first.stem[: -len(number)], int(number) - places[0]
     absent = sorted(set(range(count)) - set(places))
-    return tuple(first.with_name(f"{start}{index:0{digits}d}{first.suffix}") for index in absent)
+    return tuple(first.with_name(f"{start}{index + shift:0{len(number)}d}{first.suffix}") for index in absent)
 
 
 def image_width(folder: Path) -> int:
@@ -162,26 +167,28 @@ def photo_names(images: Sequence[Path]) -> list[str]:
 def files_of_views(folder: Path, images: Sequence[Path], images_root: Path) -> list[Path | None]:
     """Find each image's .png in ``folder``, by its path below ``images_root``, else by its stem; None without.
 
-    Raises ``UserError`` if several images share the stem of a file.
+    COLMAP's way, by the image's name with its suffix (v1.jpg.png), is found too. Raises ``UserError`` if several images
+    share the stem of a file.
     """
     if not folder.is_dir():
         return [None] * len(images)
-    present = {path.relative_to(folder) for path in folder.rglob("*.png")}
+    present = {
+        path.relative_to(folder).with_suffix("").as_posix(): path
+        for path in sorted(folder.rglob("*"))
+        if path.suffix.lower() == ".png" and not path.name.startswith(".")
+    }
     stems = Counter(image.stem for image in images)
     files: list[Path | None] = []
     for image in images:
         below = image.relative_to(images_root) if image.is_relative_to(images_root) else Path(image.name)
-        if below.with_suffix(".png") in present:
-            files.append(folder / below.with_suffix(".png"))
-        elif Path(f"{image.stem}.png") not in present:
-            files.append(None)
-        elif stems[image.stem] > 1:
+        own = (present.get(name) for name in (below.with_suffix("").as_posix(), below.as_posix()))
+        found = next((path for path in own if path is not None), None)
+        if found is None and (found := present.get(image.stem) or present.get(image.name)) and stems[image.stem] > 1:
             raise UserError(
-                f"{folder / image.stem}.png could belong to {stems[image.stem]} images called {image.stem}: "
+                f"{found} could belong to {stems[image.stem]} images called {image.stem}: "
                 f"put it at the image's own path below {folder}."
             )
-        else:
-            files.append(folder / f"{image.stem}.png")
+        files.append(found)
     return files
 
 
@@ -200,16 +207,17 @@ def unposed_note(posed: Sequence[Path]) -> str | None:
 
 def check_mask_files(folder: Path, images: Sequence[Path]) -> None:
     """Raise ``UserError`` for a folder in which there are masks, but none that belongs to an image."""
-    files = [path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES]
+    files = sorted(path for path in folder.rglob("*") if not path.name.startswith(".") and path.is_file())
+    pictures = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
     stems = {image.stem for image in images}
-    if other := next((path for path in sorted(files) if path.suffix != ".png" and path.stem in stems), None):
+    if other := next((path for path in files if path.suffix.lower() != ".png" and path.stem in stems), None):
         why, make = "masks are .png files", "save"
         if other.suffix.lower() in (".jpg", ".jpeg"):
             why, make = "JPEG blurs class ids", "make them anew and save"
         raise UserError(
             f"the masks in {folder} are {other.suffix} files, as {other.name}, but {why}: {make} them as PNG."
         )
-    if any(path.suffix == ".png" for path in files):
+    if any(path.suffix.lower() == ".png" for path in pictures):
         raise UserError(
             f"no mask in {folder} has the name of an image ({images[0].stem}.png, ...): rename the masks, or give "
             "another masks_path."

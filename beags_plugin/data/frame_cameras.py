@@ -14,6 +14,7 @@ LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _ALIASES = {"fx": "fl_x", "fy": "fl_y", "width": "w", "height": "h"}
 _FOCAL = {"x": ("fl_x", "camera_angle_x", "x_fov"), "y": ("fl_y", "camera_angle_y", "y_fov")}  # the first one counts
 _SIZE = ("w", "h")
+_MODELS = {"PERSPECTIVE": "PINHOLE", "FISHEYE": "OPENCV_FISHEYE"}  # other programs' names
 _ANGLES = ("camera_angle_x", "camera_angle_y")  # radians
 _DEGREES = ("x_fov", "y_fov")
 NUMBERS = ("fl_x", "fl_y", *_ANGLES, *_DEGREES, *_SIZE, "cx", "cy", *LENS)
@@ -47,7 +48,7 @@ def check_numbers(file: Path, whose: str, entries: dict[str, Any]) -> None:
     for key in NUMBERS:
         if key not in entries:
             continue
-        value = entries[key] = _number(entries[key])
+        value = entries[key] = number(entries[key])
         if not finite(value):
             raise UserError(f"{file}: {whose} has {key} = {value!r:.40}, which is no finite number: correct it.")
         if (key in ("fl_x", "fl_y") and not value > 0) or (key in _SIZE and not 1 <= value <= 1e6):
@@ -82,9 +83,10 @@ def frame_camera(
             )
         lens = tuple(map(float, given))
     model = entries.get("camera_model") or ("OPENCV_FISHEYE" if entries.get("is_fisheye") is True else "OPENCV")
+    model = _MODELS.get(str(model).upper(), str(model).upper())
     return FrameCamera(
         fx, fy, float(entries.get("cx", width / 2)), float(entries.get("cy", height / 2)), width, height, lens,
-        str(model),
+        model,
     )  # fmt: skip
 
 
@@ -126,7 +128,7 @@ def _along(entries: Mapping[str, Any], axis: str, pixels: int) -> float | None:
     return None
 
 
-def _number(value: Any) -> Any:
+def number(value: Any) -> Any:
     """Return a number that is written as text as a number; anything else as it is."""
     if isinstance(value, str):
         try:

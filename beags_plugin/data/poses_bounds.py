@@ -29,8 +29,14 @@ def read_poses_bounds(file: Path, images: Path) -> PoseTable:
         rows = load_array(file)
     except (OSError, ValueError) as error:
         raise UserError(f"the poses {file} cannot be read ({reason(error)}): save them as LLFF does.") from error
-    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f" or not np.isfinite(rows).all():
-        raise UserError(f"the poses {file} are no finite [views, 17] numbers: save them as LLFF does.")
+    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
+        raise UserError(
+            f"the poses {file} are {list(rows.shape)} of {rows.dtype} instead of [views, 17] numbers: save them as LLFF "
+            "does."
+        )
+    rows = rows.astype(np.float64)
+    if not np.isfinite(rows).all():
+        raise UserError(f"the poses {file} hold what is no finite number, such as NaN: save them as LLFF does.")
     files = list_images(images)
     missing: tuple[Path, ...] = ()
     if (places := numbered(files, len(rows))) is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from beags_plugin.data.frame_cameras import check_numbers, finite
+from beags_plugin.data.frame_cameras import check_numbers, finite, number
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.stand_ins import stand_in
 from beags_plugin.system.reading.text import load_json, reason
@@ -32,7 +32,7 @@ def read_transforms(file: Path) -> dict[str, Any]:
             raise UserError(f"{file} gives {name} two poses: keep one of its frames.")
         seen.add(name)
         check_numbers(file, f"the frame of {name}", frame)
-        _check_matrix(file, f"the frame of {name} in {file}", name, frame.get("transform_matrix"))
+        frame["transform_matrix"] = _checked_matrix(file, name, frame.get("transform_matrix"))
     _check_rest(file, meta)
     return meta
 
@@ -44,11 +44,18 @@ def _checked_name(file: Path, index: int, frame: Any) -> str:
     return name
 
 
-def _check_matrix(file: Path, whose: str, name: str, matrix: Any) -> None:
+def _checked_matrix(file: Path, name: str, matrix: Any) -> list[list[float]]:
+    """Return 3 or 4 rows of a pose, which may also be written as one list, or as text."""
+    if isinstance(matrix, list) and len(matrix) in (12, 16) and not any(isinstance(each, list) for each in matrix):
+        matrix = [matrix[at : at + 4] for at in range(0, len(matrix), 4)]
     if not _is_matrix(matrix):
-        raise UserError(f"{whose} has no transform_matrix of 4 x 4 numbers: give it one.")
+        raise UserError(
+            f"the frame of {name} in {file} has no transform_matrix of 4 x 4 numbers: give it one, or delete it."
+        )
+    matrix = [[number(value) for value in row] for row in matrix]
     if not all(finite(value) for row in matrix for value in row):
         raise UserError(f"the transform_matrix of {name} in {file} holds what is no finite number: correct it.")
+    return matrix
 
 
 def _is_matrix(matrix: Any) -> bool:

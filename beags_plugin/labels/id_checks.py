@@ -12,6 +12,8 @@ from beags_plugin.system.errors import UserError
 
 LEAST_RAMPS = 12  # outlines crossed by rows and columns over a value between: fewer may be chance
 RAMPS = 0.3  # share of crossings with a value between; thin objects have few, a smoothed mask of ids 0 and 2 has half
+_WIDTHS = {1: RAMPS, 2: 0.8}
+"""Pixels of a value between, and that share. Rims of two pixels may be thin things, unless they fill areas elsewhere."""
 LEAST_SOLID = 0.2  # share of pixels amid 3 x 3 of one id: less is noise, which has no outlines
 MOST_DUST = 8  # ids that fill no area of 3 x 3 pixels, but lie about in so many pieces each:
 PIECES = 4
@@ -59,22 +61,37 @@ def check_areas(path: Path | str, labels: np.ndarray, what: str) -> None:
 def _ramps(labels: np.ndarray) -> list[int] | None:
     """Return the ids that lie between others along most outlines; None where outlines are hard."""
     values = labels.astype(np.int32)
+    for widest, share in _WIDTHS.items():
+        crossings, ramps, seen = _crossings(values, widest)
+        if ramps < widest * LEAST_RAMPS or ramps < share * crossings:
+            continue
+        if widest == 1 or seen <= set(np.unique(labels[1:-1, 1:-1][_solid(labels)]).tolist()):
+            return sorted(seen)
+    return None
+
+
+def _crossings(values: np.ndarray, widest: int) -> tuple[int, int, set[int]]:
+    """Return the numbers of outlines that rows and columns of ``values`` [H, W] int32 cross, and of ramps among them.
+
+    A ramp climbs or falls by way of ids of at most ``widest`` pixels each, which the last part lists. Jumps to a
+    neighbouring id do not count: nothing lies between. Jumps to and from IGNORE are no outlines.
+    """
     crossings = ramps = 0
     seen: set[int] = set()
     for image in (values, values.T):
         jump = np.diff(image, axis=1)
         jump[(image[:, 1:] == IGNORE) | (image[:, :-1] == IGNORE)] = 0
-        step = np.sign(jump)
-        goes_on = (step[:, 1:] == step[:, :-1]) & (step[:, 1:] != 0)  # the pixel between lies between in value too
-        first, last = step != 0, step != 0
-        first[:, 1:] &= ~goes_on
-        last[:, :-1] &= ~goes_on
-        crossings += int((first & ~last).sum() + (first & last & (np.abs(jump) >= 2)).sum())
-        ramps += int((first & ~last).sum())
-        seen.update(np.unique(image[:, 1:-1][goes_on]).tolist())
-    if ramps < LEAST_RAMPS or ramps < RAMPS * crossings:
-        return None
-    return sorted(seen)
+        row, at = np.nonzero(jump)
+        size = jump[row, at]
+        near = (row[1:] == row[:-1]) & (at[1:] - at[:-1] <= widest)
+        goes_on = near & (np.sign(size[1:]) == np.sign(size[:-1]))  # what lies between two jumps lies between in value
+        before, after = np.zeros(len(size), bool), np.zeros(len(size), bool)
+        before[1:], after[:-1] = goes_on, goes_on
+        begun = int((after & ~before).sum())
+        crossings += begun + int((~after & ~before & (np.abs(size) >= 2)).sum())
+        ramps += begun
+        seen.update(np.unique(image[row[1:][goes_on], at[1:][goes_on]]).tolist())
+    return crossings, ramps, seen
 
 
 def _solid(labels: np.ndarray) -> np.ndarray:

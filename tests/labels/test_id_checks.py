@@ -161,3 +161,17 @@ def test_masks_of_another_file_type_are_not_overlooked(tmp_path, suffix, words):
         write_image(tmp_path / f"masks/v{index:02d}{suffix}", np.zeros((12, 20), np.uint8))
     with pytest.raises(UserError, match=f"the masks in .* are {suffix} files, as v00{suffix}, but .*{words}"):
         parse(tmp_path)
+
+
+def test_wide_ramps_are_smoothing_but_rims_of_a_plate_are_not():
+    """Four times as large, the value between two ids is two pixels wide, as a thin rim may be."""
+    rows, columns = np.mgrid[:96, :128]
+    labels = np.zeros((96, 128), np.uint8)
+    for value, x in ((1, 30), (2, 90)):
+        labels[(columns - x) ** 2 + (rows - 45) ** 2 < 14**2] = value
+    with pytest.raises(UserError, match="between its ids along outlines"):
+        check_ids("a.png", cv2.resize(labels, None, fx=4, fy=4, interpolation=cv2.INTER_LINEAR))
+    plate = np.zeros((96, 128), np.uint8)
+    far = np.hypot(columns - 60, rows - 45)
+    plate[far < 22], plate[far < 20] = 1, 2
+    check_ids("a.png", plate)

@@ -66,7 +66,7 @@ def check_cameras(cameras: Cameras, images: Sequence[Path]) -> None:
             kind = CameraType(int(cameras.camera_type[i])).name
             raise UserError(f"the camera of {path} is of type {kind}: undistort the images to a pinhole camera first.")
         if not rigid[i]:
-            raise UserError(f"the pose of {path} is not a rotation and a translation: correct its transform_matrix.")
+            raise UserError(f"the pose of {path} is not a rotation and a translation: correct its pose.")
         K = [float(getattr(cameras, name)[i]) for name in ("fx", "fy", "cx", "cy")]
         if not all(map(math.isfinite, K)) or not min(K[:2]) > 0:
             raise UserError(

@@ -15,7 +15,8 @@ from beags_plugin.data.frame_cameras import LENS, FrameCamera
 from beags_plugin.data.photo_files import plain_name, without_suffix
 from beags_plugin.plugin.views.colmap_model import lines_of, model_files, read, read_cameras, read_images
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.colors import as_bytes
+from beags_plugin.system.reading.colors import GREY, as_bytes
+from beags_plugin.system.reading.text import number_of
 
 _POINT = struct.Struct("<QdddBBBdQ")  # id, position, colour, error, length of the track
 
@@ -81,7 +82,9 @@ def read_features(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 def _text_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
     rows = [line.split(maxsplit=7)[:7] for line in lines_of(file) if line.strip()]
-    by_id = {int(row[0]): [float(word) for word in row[1:]] for row in rows}
+    if short := next((row for row in rows if len(row) not in (4, 7)), None):
+        raise ValueError(f"the line {' '.join(short)!r:.60} is no point: id, x, y, z, red, green, blue")
+    by_id = {int(row[0]): [number_of(word) for word in row[1:]] + [GREY] * (7 - len(row)) for row in rows}
     table = np.array(list(by_id.values()), np.float64).reshape(-1, 6)
     colors = table[:, 3:]
     if len(colors) and (colors == np.round(colors)).all() and colors.max() < 1 << 31:

@@ -77,7 +77,11 @@ def read(reader: Callable[[Path], Found], file: Path) -> Found:
 
 def lines_of(file: Path) -> Iterator[str]:
     """Yield the lines of a text file of a model without comments; line ends of any system are cut off."""
-    lines = re.split(r"\r\n|\n|\r", read_text(file))  # not splitlines: names may hold what that takes for an end
+    try:
+        text = read_text(file)
+    except UnicodeDecodeError:  # Windows writes names in its own code page
+        text = _decoded(file.read_bytes())
+    lines = re.split(r"\r\n|\n|\r", text)  # not splitlines: names may hold what that takes for an end
     return (line for line in lines if not line.lstrip().startswith("#"))
 
 

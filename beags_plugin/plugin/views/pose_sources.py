@@ -119,8 +119,11 @@ def _of_colmap(poses: ColmapModel, root: Path) -> SourceViews:
                 f"{images_file} gives {image.name} the camera {image.camera}, which {cameras_file} lacks: export the "
                 "model again."
             )
+        length = np.linalg.norm(image.quaternion)
+        if not (length > 0 and np.isfinite(image.translation).all()):
+            raise UserError(f"{images_file} gives {image.name} no pose that is a number: export the model again.")
         world_to_camera = np.eye(4)
-        world_to_camera[:3] = np.c_[qvec2rotmat(image.quaternion), image.translation]
+        world_to_camera[:3] = np.c_[qvec2rotmat(image.quaternion / length), image.translation]
         matrix[:] = np.linalg.inv(world_to_camera)[:3] * [1.0, -1.0, -1.0, 1.0]
     matrices = _COLMAP_APPLIED[:, :3] @ matrices
     members = {

@@ -85,7 +85,7 @@ def _cameras(file: Path, given: Sequence[FrameCamera], poses: Tensor, images: Se
         if camera.model not in CAMERA_MODEL_TO_TYPE:
             raise UserError(
                 f"the camera of {image} in {file} is of the model {camera.model!r}, which is unknown: name OPENCV or "
-                "OPENCV_FISHEYE."
+                "OPENCV_FISHEYE, or undistort the photos."
             )
     K = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in given], dtype=torch.float64).float()
     sizes = torch.tensor([[camera.width, camera.height] for camera in given])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from beags_plugin.data.layouts.colmap import points_file
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.colmap_files import read_colmap_points
 from beags_plugin.plugin.views.poses import PosedViews
+from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
 from beags_plugin.system.reading.ply import read_ply_points
 
@@ -35,7 +37,7 @@ def starting_points(scene: Dataset, views: PosedViews, count: int) -> dict[str, 
     if isinstance(scene.poses, ColmapModel):
         file = file or points_file(scene.poses.folder)
     if file is not None:
-        points, colors = (read_ply_points if file.suffix == ".ply" else read_colmap_points)(file)
+        points, colors = _read(file)
         moved = views.placing.points(points, original=isinstance(scene.poses, ColmapModel))
         there = _seen_by_any(moved.numpy(), cameras)
         if bounds is not None:
@@ -51,6 +53,29 @@ def starting_points(scene: Dataset, views: PosedViews, count: int) -> dict[str, 
     else:
         xyz, rgb = points_between(cameras, scale * bounds, count)
     return {"points3D_xyz": torch.from_numpy(xyz), "points3D_rgb": torch.from_numpy(rgb), "points3D_random": True}
+
+
+def _read(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read positions [N, 3] float64 and colours [N, 3] uint8 of a file; points whose places are no numbers are left out.
+
+    Raises ``UserError`` for a file of another kind, or where no point is left of some.
+    """
+    if file.suffix.lower() == ".ply":
+        points, colors = read_ply_points(file)
+    elif file.suffix.lower() in (".bin", ".txt") or not file.is_file():
+        points, colors = read_colmap_points(file)
+    else:
+        raise UserError(
+            f"the seed points {file} are of a format that is not read: save them as a .ply, and name that in "
+            "ply_file_path."
+        )
+    known = np.isfinite(points).all(axis=1)
+    if known.all():
+        return points, colors
+    if not known.any():
+        raise UserError(f"the seed points {file} are no numbers: export them again, or remove the key.")
+    say(f"{np.count_nonzero(~known)} of the {len(points)} seed points in {file} are no numbers: they are left out.")
+    return points[known], colors[known]
 
 
 def random_points(cameras: Sequence[Camera], count: int) -> tuple[np.ndarray, np.ndarray]:

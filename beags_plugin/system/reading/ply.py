@@ -14,7 +14,7 @@ import numpy as np
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.colors import colors_of
 from beags_plugin.system.reading.stand_ins import stand_in
-from beags_plugin.system.reading.text import reason
+from beags_plugin.system.reading.text import number_of, reason
 
 _HEADER_BYTES = 1 << 20  # a header is longer than this in no file that is one
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -109,21 +109,21 @@ def write_vertices(file: BinaryIO, table: np.ndarray, comment: str = "") -> None
 def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read positions [N, 3] float64 and colours [N, 3] uint8 (mid-grey if there are none) of a .ply's vertices.
 
-    Raises ``UserError`` if the file is absent or has no vertices with x, y, z.
+    Positions are as they are, finite or not. Raises ``UserError`` if the file is absent or has no vertices with x, y, z.
     """
     if not path.is_file():
         raise UserError(f"the seed points {path} (ply_file_path) do not exist: restore the file or remove the key.")
     try:
         vertices = read_vertices(path)
-        points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        named = {name.casefold(): name for name in vertices.dtype.names or ()}
+        points = np.stack([vertices[named.get(axis, axis)] for axis in "xyz"], axis=1).astype(np.float64)
     except OSError as error:
         raise UserError(f"the seed points {path} cannot be read ({error.strerror}): restore the file.") from error
     except (ValueError, MemoryError) as error:
+        todo = "export them again" if stand_in(path) is None else "then try again"
         raise UserError(
-            f"the seed points {path} cannot be read as a .ply with x, y, z ({reason(error)}): export them again."
+            f"the seed points {path} cannot be read as a .ply with x, y, z ({reason(error)}): {todo}."
         ) from error
-    if not np.isfinite(points).all():
-        raise UserError(f"the seed points {path} are not all numbers: export them again, or remove the key.")
     return points, colors_of(vertices)
 
 
@@ -197,7 +197,8 @@ def _from_text(path: Path, header: _Header, before: list[_Element], element: _El
     table = np.empty(element.count, element.numbers("<"))
     for name, words in columns.items():
         try:
-            table[name] = np.array(words, object).astype(table.dtype[name])
+            numbers = words if table.dtype[name].kind in "iu" else [number_of(word) for word in words]
+            table[name] = np.array(numbers, object).astype(table.dtype[name])
         except (ValueError, OverflowError) as error:
             raise ValueError(f"column {name}: {reason(error)}") from None
     return table

@@ -44,8 +44,12 @@ def load_json(path: Path, object_pairs_hook: Callable[[list], Any] | None = None
     Comments, a comma behind the last entry, and any spelling of NaN and Infinity are read too.
     """
     text = read_text(path)
+
+    def parsed(given: str) -> Any:
+        return json.loads(given, object_pairs_hook=object_pairs_hook, strict=False)  # tabs within texts are read
+
     try:
-        return json.loads(text, object_pairs_hook=object_pairs_hook)
+        return parsed(text)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
     except ValueError:
@@ -54,7 +58,7 @@ def load_json(path: Path, object_pairs_hook: Callable[[list], Any] | None = None
         if (strict := _LOOSE.sub(_strict, text)) == text:
             raise
         try:
-            return json.loads(strict, object_pairs_hook=object_pairs_hook)
+            return parsed(strict)
         except ValueError:
             pass
         raise
@@ -69,6 +73,17 @@ def _strict(part: re.Match[str]) -> str:
     if part["endless"] is not None:
         return ("-" if part["sign"] == "-" else "") + "Infinity"
     return "\n" * part[0].count("\n")
+
+
+def number_of(word: str) -> float:
+    """Return the number that a word of a text file stands for, also C's words for none; raises ``ValueError``."""
+    try:
+        return float(word)
+    except ValueError:
+        found = _LOOSE.fullmatch(word)
+        if found is None or not (found["nan"] or found["endless"]):
+            raise
+        return float(_strict(found).lower())
 
 
 def load_toml(path: Path) -> dict[str, Any]:
