@@ -173,7 +173,7 @@ class Export:
     whole: bool = False
     """The whole scene in one file; without --object and --all it needs no classes."""
     format: tuple[str, ...] = ("ply",)
-    """ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), spz, compressed-ply, sog (all small),
+    """ply (viewers of 3D Gaussians), ply-2dgs (the official 2DGS code), spz, compressed-ply, sog, splat (all small),
     gltf-splats, usdz-splats, usda-splats, gltf-both (splats and mesh), html (a page to send), glb, usdz, obj (meshes),
     stl, 3mf (to print), or your own."""
     frame: str = "world"

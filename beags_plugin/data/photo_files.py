@@ -32,7 +32,8 @@ class PhotoFinder:
     """Finds files below folders by names that were written elsewhere.
 
     roots: folders, the first one counts first. A name means the file of exactly that path; else one whose path differs
-    in the slashes of Windows, in case, in spaces at its ends, in the form of its accents or in what web addresses escape, lacks the suffix of
+    in the slashes of Windows, in case, in spaces at its ends, in the form of its accents or in what web addresses
+    escape, lacks the suffix of
     an image or has another one; else a file below the roots whose path is an end of the named one (images/a.jpg for
     C:/scene/images/a.jpg), as far as no folder of the name's beginning exists.
     """

@@ -31,8 +31,8 @@ def read_poses_bounds(file: Path, images: Path) -> PoseTable:
         raise UserError(f"the poses {file} cannot be read ({reason(error)}): save them as LLFF does.") from error
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
         raise UserError(
-            f"the poses {file} are {list(rows.shape)} of {rows.dtype} instead of [views, 17] numbers: save them as LLFF "
-            "does."
+            f"the poses {file} are {list(rows.shape)} of {rows.dtype} instead of [views, 17] numbers: save "
+            "them as LLFF does."
         )
     rows = rows.astype(np.float64)
     if not np.isfinite(rows).all():

@@ -10,6 +10,7 @@ EXPORTERS = Registry(
         "ply-2dgs": "beags_plugin.export.splats:SurfelPlyExporter",
         "compressed-ply": "beags_plugin.export.compressed_ply:CompressedPlyExporter",
         "sog": "beags_plugin.export.sog:SogExporter",
+        "splat": "beags_plugin.export.splats:SplatExporter",
         "spz": "beags_plugin.export.spz:SpzExporter",
         "gltf-splats": "beags_plugin.export.gltf_splats:GltfSplatsExporter",
         "gltf-both": "beags_plugin.export.gltf_splats:GltfBothExporter",

@@ -1,4 +1,4 @@
-"""Gaussians as .ply files: for viewers of 3D Gaussians, and for programs of 2D Gaussian splatting."""
+"""Gaussians as .ply files, for viewers of 3D Gaussians and programs of 2D Gaussian splatting, and as .splat."""
 
 from __future__ import annotations
 
@@ -6,8 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+
+from beags_plugin.core.densification import SH_C0
 from beags_plugin.export.base import Exporter, ExportItem
+from beags_plugin.export.splat_values import splat_values
+from beags_plugin.extraction.files import whole_file
 from beags_plugin.extraction.ply import write_ply
+
+_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
 
 
 @dataclass(frozen=True)
@@ -29,4 +36,28 @@ class SurfelPlyExporter(Exporter):
 
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
         write_ply(path, item.surfels, item.class_ids, layout="2dgs", invented=item.invented)
+        return {}
+
+
+@dataclass(frozen=True)
+class SplatExporter(Exporter):
+    """The .splat of antimatter15's viewer: 32 bytes a Gaussian, the largest and most opaque first, as it sorts them.
+
+    Colours do not change with the view, rotations have 8 bits, so that thin discs are tilted by up to a degree, and
+    there are no class ids.
+    """
+
+    suffix: ClassVar[str] = "splat"
+
+    def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
+        values = splat_values(item.surfels, item.name)
+        size = values.opacities * np.exp(values.log_scales[:, :2].sum(axis=1))
+        order = np.argsort(-size, kind="stable")
+        rows = np.empty(len(values), _ROW)
+        rows["mean"], rows["scale"] = values.means[order], np.exp(values.log_scales[order])
+        colors = np.column_stack([0.5 + SH_C0 * values.sh_dc, values.opacities])[order]
+        rows["color"] = np.rint(255.0 * colors).clip([0, 0, 0, 1], [255, 255, 255, 254])  # 255 is an infinite logit
+        rows["quat"] = np.rint(128.0 * values.quats[order] + 128.0).clip(0, 255)
+        with whole_file(path) as part:
+            part.write_bytes(rows.tobytes())
         return {}

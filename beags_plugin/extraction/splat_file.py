@@ -14,6 +14,7 @@ from beags_plugin.core.densification import SH_C0
 from beags_plugin.core.flattening import Gaussians
 from beags_plugin.core.sh import MAX_DEGREE, num_sh_bases
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.colors import range_of
 from beags_plugin.system.reading.ply import read_vertices
 from beags_plugin.system.reading.text import reason
 
@@ -55,6 +56,7 @@ def read_splat_file(path: str | Path) -> SplatFile:
     as_rgb = colors[0] not in present and "red" in present
     if as_rgb:
         colors = ("red", "green", "blue")
+    as_rgb = as_rgb or (colors[0] in present and _whole(vertex, colors[0]))  # shares of 1 in bytes, whatever their name
     blocks = [("x", "y", "z"), colors, ("opacity",), numbered("scale", 3 if "scale_2" in present else 2)]
     blocks += [numbered("rot", 4), numbered("f_rest", rest_count)]
     if missing := sorted({name for block in blocks for name in block} - present):
@@ -67,10 +69,14 @@ def read_splat_file(path: str | Path) -> SplatFile:
         return torch.from_numpy(table)
 
     means, dc, opacity, scales, quats, rest = (take(block) for block in blocks)
+    if _whole(vertex, "opacity"):
+        opacity = torch.logit(shares(vertex["opacity"][:, None]))
+    if vertex.dtype["rot_0"] == np.uint8:
+        quats = (quats - 128.0) / 128.0
     rest = rest.reshape(len(dc), 3, rest_count // 3).transpose(1, 2)
     remarks = []
     if as_rgb:
-        dc = (_shares(dc, vertex.dtype["red"]) - 0.5) / SH_C0
+        dc = (shares(np.stack([vertex[name] for name in colors], axis=1)) - 0.5) / SH_C0
         if not rest_count:
             remarks.append("It has colours as red, green and blue: each Gaussian has one colour from all sides.")
     if degree > MAX_DEGREE:
@@ -80,11 +86,14 @@ def read_splat_file(path: str | Path) -> SplatFile:
     return SplatFile(Gaussians(means, quats, scales, opacity[:, 0], dc, rest), ids, tuple(remarks))
 
 
-def _shares(colors: Tensor, kind: np.dtype) -> Tensor:
-    """Return colours [N, 3] as shares of 1: integers are shares of their type's range, floats above 1 of 255."""
-    if kind.kind in "ui":
-        return colors / float(np.iinfo(kind).max)
-    return colors / 255.0 if bool((colors > 1.0).any()) else colors
+def _whole(vertex: np.ndarray, name: str) -> bool:
+    return vertex.dtype[name].kind in "ui"
+
+
+def shares(values: np.ndarray) -> Tensor:
+    """Return values [N, C] of any type as shares of 1, float32, by the type and the range as those of seed points."""
+    values, most = range_of(values)
+    return torch.from_numpy((values / (most or 1.0)).astype(np.float32))
 
 
 def numbered(prefix: str, count: int) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ StartValues = Literal["auto", "logs", "activated"]
 _ENOUGH = 32  # Gaussians of which the opacities alone tell something
 _SAMPLE = 4096  # Gaussians whose nearest neighbours are looked for
 _FITTING = (0.02, 50.0)  # the median scale over the median distance to the nearest neighbours of trained scenes
+_MOST_LOGIT = 40.0  # of an opacity that differs from 1 in double precision
 _SPREAD = 0.3  # least standard deviation of the logs of a trained scene's scales
 _THINNEST = 1e-12  # units of length: of scales that are 0, as writers of discs leave the third
 
@@ -31,13 +32,14 @@ def stored_values(path: Path, gaussians: Gaussians, values: StartValues) -> tupl
     """Return the Gaussians with logs of scales and logits of opacities, and sentences on what was converted.
 
     gaussians: N, their scales and opacities as they stand in ``path``. Raises ``UserError`` where ``values`` is "auto"
-    and the ranges fit both.
+    and the ranges fit both, or neither.
     """
     if values == "logs":
         return gaussians, ()
     if values == "activated":
         scales, opacities = True, True
     else:
+        _check_opacities(path, gaussians)
         opacities = _opacities_activated(gaussians)
         scales = _scales_activated(path, gaussians, opacities)
         opacities = opacities and (scales or _tells_much(gaussians.opacity_logits))
@@ -58,6 +60,17 @@ def stored_values(path: Path, gaussians: Gaussians, values: StartValues) -> tupl
 
 def _finite(values: Tensor) -> Tensor:
     return values[values.isfinite()]
+
+
+def _check_opacities(path: Path, gaussians: Gaussians) -> None:
+    """Raise ``UserError`` for opacities in percent or of 255."""
+    values = _finite(gaussians.opacity_logits)
+    if len(values) and bool((values >= 0).all()) and float(values.max()) > _MOST_LOGIT:
+        raise UserError(
+            f"the opacities of {path} lie in 0..{float(values.max()):g}, where neither logits nor shares of 1 do: "
+            "divide them by 100 or 255 where the file was made, or take them as logits with "
+            "--pipeline.model.start-values logs."
+        )
 
 
 def _opacities_activated(gaussians: Gaussians) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -12,9 +13,16 @@ from torch import Tensor
 from beags_plugin.core.flattening import Gaussians
 from beags_plugin.importers.activation import StartValues, stored_values
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.pasted import command
 
-_OTHERS = {".ksplat": "splat-transform {path} {stem}.ply", ".lcc": "splat-transform {path} {stem}.ply"}
+_OTHERS: dict[str, Callable[[Path], str]] = {
+    **dict.fromkeys((".ksplat", ".lcc"), lambda path: command(["splat-transform", path, path.with_suffix(".ply")])),
+    ".gz": lambda path: command(["gunzip", "-k", path]),
+    ".zip": lambda path: command(["unzip", path]),
+    ".7z": lambda path: command(["7z", "x", path]),
+}
 """Commands of other programs that turn formats which no importer reads into one of those that are read."""
+_CHECKPOINTS = (".pt", ".pth")  # of gsplat's examples and of 3DGS, which write .ply files too
 
 
 @dataclass(frozen=True)
@@ -68,9 +76,10 @@ def find_importer(path: Path) -> Importer:
     importers: dict[str, Importer] = {name: IMPORTERS.get(name)() for name in IMPORTERS.names()}
     fitting = [name for name, importer in importers.items() if importer.recognises(path)]
     if not fitting:
-        if (command := _OTHERS.get(path.suffix.lower())) is not None:
-            command = command.format(path=path.name, stem=path.stem)
-            raise UserError(f"{path} is of a format that is not read: convert it first, as by {command}")
+        if (convert := _OTHERS.get(path.suffix.lower())) is not None:
+            raise UserError(f"{path} is of a format that is not read: convert it first, as by {convert(path)}")
+        if path.suffix.lower() in _CHECKPOINTS:
+            raise UserError(f"{path} is a checkpoint of another program: name the .ply that it writes beside it.")
         known = "; ".join(importer.marks for importer in importers.values())
         raise UserError(f"{path} is nothing to start from: name one of these: {known}.")
     if len(fitting) > 1:

@@ -19,7 +19,7 @@ from beags_plugin.core.flattening import Gaussians
 from beags_plugin.core.sh import MAX_DEGREE, num_sh_bases
 from beags_plugin.extraction.frames import turned_gaussians
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.stand_ins import stand_in
+from beags_plugin.system.reading.stand_ins import stand_in, starts_as
 from beags_plugin.system.reading.text import reason
 
 _DAMAGED = (
@@ -41,7 +41,14 @@ def reading(path: Path, kind: str) -> Iterator[None]:
             raise UserError(f"{path} cannot be read ({reason(error)}): name an existing {kind} file.") from error
         if (cause := stand_in(path)) is not None:
             raise UserError(f"{path} is no {kind} file ({cause}).") from error
+        if (cause := starts_as(path)) is not None and not _fits(path, cause):
+            raise UserError(f"{path} is no {kind} file ({cause}).") from error
         raise UserError(f"{path} is no {kind} file, or damaged ({reason(error)}): get it again.") from error
+
+
+def _fits(path: Path, start: str) -> bool:
+    """Return whether a file of this name starts as such files do, so that it is damaged, not misnamed."""
+    return path.suffix.lower() in start.partition(":")[0]
 
 
 def tensor(values: np.ndarray) -> Tensor:

@@ -10,15 +10,26 @@ from beags_plugin.importers.base import ImportedScene, Importer
 from beags_plugin.importers.compressed_ply import is_compressed
 
 
+def newest_of_run(path: Path) -> Path | None:
+    """Return the .ply of the last iteration in the folder of a run of 3DGS or 2DGS; None for another path."""
+    found = [file for file in path.glob("point_cloud/iteration_*/point_cloud.ply") if _iteration(file).isdigit()]
+    return max(found, key=lambda file: int(_iteration(file)), default=None)
+
+
+def _iteration(file: Path) -> str:
+    return file.parent.name.removeprefix("iteration_")
+
+
 class PlyImporter(Importer):
     """The official layouts, in the world of the input poses, where the official programs and ``beags export`` write."""
 
-    marks: ClassVar[str] = "a splat .ply"
+    marks: ClassVar[str] = "a splat .ply, or the folder of a run of 3DGS or 2DGS"
 
     def recognises(self, path: Path) -> bool:
-        return path.is_file() and path.suffix.lower() == ".ply" and not is_compressed(path)
+        file = newest_of_run(path) or path
+        return file.is_file() and file.suffix.lower() == ".ply" and not is_compressed(file)
 
     def read(self, path: Path) -> ImportedScene:
-        read = read_splat_file(path)
+        read = read_splat_file(newest_of_run(path) or path)
         kind = "2DGS .ply" if read.gaussians.log_scales.shape[1] == 2 else "3DGS .ply"
         return ImportedScene(kind, read.gaussians, remarks=read.remarks, free_values=True)

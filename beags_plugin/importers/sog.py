@@ -21,6 +21,10 @@ from beags_plugin.importers.packed import cut_bands, gaussians_of, reading, with
 
 _META = "meta.json"
 _ROW = 64  # palette entries in a row of their image
+_LARGEST_META = 1 << 24  # bytes
+_UNPACKED, _SMALL = 4, 1 << 16  # bytes that one of a packed image may become, and what any may
+_PACKED = 64  # Gaussians whose places a byte may hold: more than hold any but those all of one place
+_PALETTE = 1 << 24  # pixels of the image of 65,536 entries with 24 coefficients, and as many again
 _TAG = 252  # plus the place of the component that a rotation leaves out
 
 
@@ -30,14 +34,30 @@ class SogImporter(Importer):
     marks: ClassVar[str] = "a .sog"
 
     def recognises(self, path: Path) -> bool:
+        if path.is_dir():
+            return (path / _META).is_file()
         return path.is_file() and (path.suffix.lower() == ".sog" or path.name == _META)
 
     def read(self, path: Path) -> ImportedScene:
+        path = path / _META if path.is_dir() else path
         with reading(path, ".sog"):
             if path.name == _META:
                 return _scene(lambda name: (path.parent / _inside(name)).read_bytes())
             with zipfile.ZipFile(path) as archive:
-                return _scene(archive.read)
+                return _scene(lambda name: _member(archive, name))
+
+
+def _member(archive: zipfile.ZipFile, name: str) -> bytes:
+    """Return a file of an archive; raises ``ValueError`` for one that unpacks to far more than such files hold.
+
+    The bound is checked as bytes come, whatever the archive says: images are packed already, and meta.json is short.
+    """
+    most = _LARGEST_META if name == _META else _UNPACKED * archive.getinfo(name).compress_size + _SMALL
+    with archive.open(name) as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise ValueError(f"its {name} unpacks to more than {most:,} bytes")
+    return content
 
 
 def _inside(name: str) -> str:
@@ -53,9 +73,12 @@ def _scene(content: Callable[[str], bytes]) -> ImportedScene:
     if meta.get("version") != 2:
         raise ValueError(f"its version is {meta.get('version')}, but 2 is read")
     count = int(meta["count"])
+    lowest = content(meta["means"]["files"][0])  # the lower bytes of places, which hardly pack
+    if not 0 <= count <= _PACKED * len(lowest) + _SMALL:
+        raise ValueError(f"it promises {count} Gaussians, which do not fit into it")
 
     def pixels(block: str, file: int = 0) -> np.ndarray:
-        found = _image(content(meta[block]["files"][file])).reshape(-1, 4)[:count]
+        found = _image(content(meta[block]["files"][file]), 4 * count + _SMALL).reshape(-1, 4)[:count]
         if len(found) < count:
             raise ValueError(f"an image of its {block} has {len(found)} of {count} pixels")
         return found
@@ -70,7 +93,9 @@ def _scene(content: Callable[[str], bytes]) -> ImportedScene:
     bands, rest = 0, np.zeros((count, 0, 3))
     if "shN" in meta:
         bands = int(meta["shN"]["bands"])
-        rest = _bands(meta, _image(content(meta["shN"]["files"][0])), pixels("shN", 1), num_sh_bases(bands) - 1)
+        rest = _bands(
+            meta, _image(content(meta["shN"]["files"][0]), _PALETTE), pixels("shN", 1), num_sh_bases(bands) - 1
+        )
     flat = meta.get("model") == "2dgs"
     gaussians = gaussians_of(
         np.sign(logs) * np.expm1(np.abs(logs)),
@@ -84,11 +109,13 @@ def _scene(content: Callable[[str], bytes]) -> ImportedScene:
     return ImportedScene(".sog of discs" if flat else ".sog", gaussians, remarks=(lost, *cut_bands(bands)))
 
 
-def _image(data: bytes) -> np.ndarray:
-    """Return [H, W, 4] int64."""
+def _image(data: bytes, most: int) -> np.ndarray:
+    """Return [H, W, 4] int64; raises ``ValueError`` for an image of more than ``most`` pixels."""
     from PIL import Image
 
-    with Image.open(io.BytesIO(data)) as image:
+    with Image.open(io.BytesIO(data), formats=["WEBP", "PNG"]) as image:
+        if image.width * image.height > most:
+            raise ValueError(f"an image of it has {image.width} x {image.height} pixels")
         return np.asarray(image.convert("RGBA")).astype(np.int64)
 
 

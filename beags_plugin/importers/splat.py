@@ -14,6 +14,7 @@ import numpy as np
 from beags_plugin.core.densification import SH_C0
 from beags_plugin.importers.base import ImportedScene, Importer
 from beags_plugin.importers.packed import gaussians_of, reading
+from beags_plugin.system.reading.stand_ins import stand_in, starts_as
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
 _THINNEST = 1e-12  # units of length: of scales that are 0
@@ -30,7 +31,9 @@ class SplatImporter(Importer):
     def read(self, path: Path) -> ImportedScene:
         with reading(path, ".splat"):
             content = path.read_bytes()
-            if not content or len(content) % _ROW.itemsize:
+            if (cause := stand_in(path) or starts_as(path)) is not None:  # nothing marks the format itself
+                raise ValueError(cause)
+            if len(content) % _ROW.itemsize:
                 raise ValueError(f"it has {len(content)} bytes, which are no whole rows of {_ROW.itemsize}")
             rows = np.frombuffer(content, _ROW)
             color = rows["color"] / 255.0

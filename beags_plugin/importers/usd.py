@@ -18,6 +18,7 @@ from beags_plugin.extraction.frames import turned_gaussians
 from beags_plugin.importers.base import ImportedScene, Importer
 from beags_plugin.importers.packed import cut_bands, gaussians_of, joined, moved_by, reading
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.stand_ins import stand_in
 
 _SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 _SURFLET = "ParticleFieldKernelGaussianSurfletAPI"
@@ -34,6 +35,8 @@ class UsdImporter(Importer):
         return path.is_file() and path.suffix.lower() in _SUFFIXES
 
     def read(self, path: Path) -> ImportedScene:
+        if (cause := stand_in(path)) is not None:
+            raise UserError(f"{path} is no USD file ({cause}).")
         try:
             Usd, UsdGeom, Tf = (import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom", "Tf"))
         except ImportError as error:

@@ -13,7 +13,7 @@ from beags_plugin.system.errors import UserError
 LEAST_RAMPS = 12  # outlines crossed by rows and columns over a value between: fewer may be chance
 RAMPS = 0.3  # share of crossings with a value between; thin objects have few, a smoothed mask of ids 0 and 2 has half
 _WIDTHS = {1: RAMPS, 2: 0.8}
-"""Pixels of a value between, and that share. Rims of two pixels may be thin things, unless they fill areas elsewhere."""
+"""Pixels of a value between, and that share. Rims of two may be thin things, unless their ids fill areas elsewhere."""
 LEAST_SOLID = 0.2  # share of pixels amid 3 x 3 of one id: less is noise, which has no outlines
 MOST_DUST = 8  # ids that fill no area of 3 x 3 pixels, but lie about in so many pieces each:
 PIECES = 4

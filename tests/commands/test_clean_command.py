@@ -60,6 +60,7 @@ def test_a_scene_is_refined_and_written_back_in_its_format(tmp_path, monkeypatch
         ("ply-2dgs", "a.2dgs.ply", {}),
         ("compressed-ply", "a.compressed.ply", {}),
         ("sog", "a.sog", {}),
+        ("splat", "a.splat", {}),
         ("spz", "a.spz", {"version": 3}),
         ("spz", "b.spz", {"version": 4}),
         ("gltf-splats", "a.splats.glb", {}),
@@ -79,9 +80,9 @@ def test_every_format_is_written_back_as_it_came(tmp_path, kind, name, options):
 
 
 def test_what_is_not_written_becomes_a_ply_and_is_said(tmp_path):
-    (tmp_path / "a.splat").write_bytes(bytes(24) + bytes([1] * 8))
-    found = format_of(tmp_path / "a.splat", read_scene(tmp_path / "a.splat"))
-    assert found.exporter == "ply" and found.note == "A .splat is not written, so a .ply of 3DGS is."
+    scene = replace(read_scene(write(tmp_path / "a.ply", "ply", random_surfels())), kind="run of splatfacto")
+    found = format_of(tmp_path, scene)
+    assert found.exporter == "ply" and found.note == "A run of splatfacto is not written, so a .ply of 3DGS is."
 
 
 def test_changes_are_counted_by_nearest_neighbours():

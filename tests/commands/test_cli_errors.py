@@ -85,8 +85,8 @@ SENTENCES = {
     "background, cup, box.",
     f"export --load-config {RUN} --all --object cup": "--all exports every object: leave --object out.",
     f"export --load-config {RUN} --object cup --format step": "there is no exporter 'step': choose one of "
-    "3mf, compressed-ply, glb, gltf-both, gltf-splats, html, obj, ply, ply-2dgs, sog, spz, stl, usda-splats, usdz, "
-    "usdz-splats.",
+    "3mf, compressed-ply, glb, gltf-both, gltf-splats, html, obj, ply, ply-2dgs, sog, splat, spz, stl, usda-splats, "
+    "usdz, usdz-splats.",
     "clean {tmp}/none.ply --data {tmp}/lab": "{tmp}/none.ply does not exist: name a splat file, a checkpoint or a run "
     "to start from.",
     f"export --load-config {RUN} --object cup --format stl": "a .stl file is in millimetres, but the size of the "

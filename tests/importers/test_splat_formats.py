@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import gzip
+import io
 import json
 import struct
+import tracemalloc
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from other_programs import READ_BY_PLAYCANVAS, READ_BY_SPZ, converted, written_by_spz
+from PIL import Image
 from random_surfels import random_surfels
 from written_splats import angles, differences, write
 
@@ -85,6 +88,44 @@ def test_any_degree_with_or_without_normals(tmp_path, degree, normals):
     assert torch.equal(scene.gaussians.sh_rest, surfels.sh_rest) and scene.remarks == ()
 
 
+@pytest.mark.parametrize("kind", ["<u2", "<i4"])
+def test_bytes_in_wider_integers_are_bytes(tmp_path, kind):
+    surfels = random_surfels(count=40, degree=0)
+    rgb = {name: np.full(40, 200, kind) for name in ("red", "green", "blue")}
+    found = read_scene(write_columns(tmp_path / "scene.ply", columns(surfels, **without_dc(), **rgb))).gaussians
+    assert torch.allclose(found.sh_dc * C0 + 0.5, torch.tensor(200 / 255), atol=1e-6)
+
+
+def test_colours_opacities_and_rotations_in_bytes(tmp_path):
+    surfels = random_surfels(count=40, degree=0)
+    table = columns(surfels)
+    table |= {f"f_dc_{i}": np.full(40, 51, np.uint8) for i in range(3)} | {"opacity": np.full(40, 204, np.uint8)}
+    quats = torch.nn.functional.normalize(surfels.quats, dim=1)
+    table |= {f"rot_{i}": (quats[:, i] * 127 + 128).numpy().astype(np.uint8) for i in range(4)}
+    found = read_scene(write_columns(tmp_path / "scene.ply", table)).gaussians
+    assert torch.allclose(found.sh_dc * C0 + 0.5, torch.tensor(0.2), atol=1e-6)
+    assert torch.allclose(opacities(found.opacity_logits), torch.tensor(0.8), atol=1e-6)
+    assert angles(found.quats, quats).max() < 2
+
+
+def test_text_with_words_for_no_number(tmp_path):
+    table = columns(random_surfels(count=3, degree=0))
+    rows = [" ".join(str(values[index]) for values in table.values()) for index in range(3)]
+    words = rows[1].split(" ")
+    rows[1] = " ".join(["-nan(ind)", *words[1:]])
+    header = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {name}" for name in table)]
+    (tmp_path / "scene.ply").write_text("\n".join([*header, "end_header", *rows]))
+    assert read_scene(tmp_path / "scene.ply").gaussians.usable().tolist() == [True, False, True]
+
+
+def test_the_folder_of_a_run_of_3dgs_means_its_last_iteration(tmp_path):
+    for iteration, count in ((7000, 5), (30000, 6), (9000, 7)):
+        folder = tmp_path / f"point_cloud/iteration_{iteration}"
+        folder.mkdir(parents=True)
+        write_columns(folder / "point_cloud.ply", columns(random_surfels(count=count)))
+    assert len(read_scene(tmp_path).gaussians) == 6
+
+
 def test_bands_above_the_third_are_left_out_and_said(tmp_path):
     surfels, fourth = random_surfels(count=12), torch.full((12, 9, 3), 7.0)
     more = Surfels(**{**vars(surfels), "sh_rest": torch.cat([surfels.sh_rest, fourth], dim=1)})
@@ -115,6 +156,15 @@ def test_activated_values_are_recognised_by_their_ranges(tmp_path, scales, alpha
     assert torch.allclose(found.log_scales, surfels.log_scales, atol=1e-5)
     assert torch.allclose(found.opacity_logits, surfels.opacity_logits, atol=1e-4)
     assert len(scene.remarks) == 1 and scene.remarks[0].startswith(f"Its {words} lie where activated values do")
+
+
+def test_opacities_of_255_are_asked_for(tmp_path):
+    surfels = random_surfels(count=40)
+    table = columns(surfels) | {"opacity": np.linspace(0, 255, 40, dtype=np.float32)}
+    path = write_columns(tmp_path / "scene.ply", table)
+    with pytest.raises(UserError, match=r"lie in 0..255, where neither logits nor shares of 1 do: divide them by 100"):
+        read_scene(path)
+    assert read_scene(path, "logs").gaussians.opacity_logits.max() == 255
 
 
 def test_a_scale_of_0_is_a_disc(tmp_path):
@@ -169,6 +219,7 @@ OURS = [
     ("compressed-ply", "scene.compressed.ply", {"angles": 0.3, "means": 5e-3, "log_scales": 5e-3, "sh_dc": 0.03}),
     ("sog", "scene.sog", {"angles": 1.2, "means": 1e-4, "log_scales": 0.35, "sh_dc": 0.15}),
     ("spz", "scene.spz", {"angles": 0.25, "means": 1e-5, "log_scales": 1 / 31, "sh_dc": 0.02}),
+    ("splat", "scene.splat", {"angles": 0.8, "sh_dc": 0.01}),
 ]
 
 
@@ -184,6 +235,9 @@ def test_every_splat_format_that_we_write_is_read(tmp_path, kind, name, bounds):
     surfels = Surfels(**{**vars(surfels), "means": apart})
     scene = read_scene(write(tmp_path / name, kind, surfels))
     assert len(scene.gaussians) == 300 and scene.normalization is None
+    if kind == "splat":  # one colour from all sides, cut to 0..1
+        dc = (surfels.sh_dc * C0 + 0.5).clamp(0, 1).sub(0.5) / C0
+        surfels = Surfels(**{**vars(surfels), "sh_dc": dc, "sh_rest": surfels.sh_rest[:, :0]})
     found = differences(sorted_by_place(flatten(scene.gaussians)[0]), sorted_by_place(surfels))
     limits = {"means": 1e-6, "log_scales": 1e-6, "sh_dc": 1e-6, "sh_rest": 0.3, "alphas": 0.003, **bounds}
     assert all(value <= limits[key] for key, value in found.items()), found
@@ -289,7 +343,7 @@ def bomb(version: int) -> bytes:
 
 def cut(path: Path) -> bytes:
     content = path.read_bytes()
-    return content[: len(content) * 2 // 3]
+    return content[: len(content) * 2 // 3 - 1]
 
 
 @pytest.mark.parametrize(
@@ -302,13 +356,20 @@ def cut(path: Path) -> bytes:
         ("a.spz", gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 1, 1, 0, 12, 0, 0) + bytes(20)), "version is 1"),
         ("a.splat", bytes(33), "33 bytes, which are no whole rows of 32"),
         ("a.splat", b"", "is no .splat file (it is empty"),
+        ("a.splat", b"version https://git-lfs.github.com/spec/v1\n".ljust(128, b"0"), "run git lfs pull"),
+        ("a.splat", b"ply\nformat binary".ljust(64), "it starts as a .ply: unpack or rename it"),
+        ("a.spz", b"ply\nformat binary", "it starts as a .ply: unpack or rename it"),
+        ("a.ply", gzip.compress(b"ply", mtime=0), "it starts as packed by gzip, as .spz is: unpack or rename it"),
+        ("a b.ksplat", b"", "splat-transform '{}/a b.ksplat' '{}/a b.ply'"),
+        ("a b.zip", b"", "as by unzip '{}/a b.zip'"),
+        ("chkpnt30000.pth", b"", "is a checkpoint of another program: name the .ply that it writes beside it"),
         ("a.sog", b"version https://git-lfs.github.com/spec/v1\n", "run git lfs pull"),
         ("a.sog", b"PK\x03\x04 nothing", "is no .sog file, or damaged"),
         ("meta.json", b'{"version": 1}', "its version is 1"),
         (
             "meta.json",
             json.dumps(
-                {"version": 2, "count": 1, "means": {"mins": [0] * 3, "maxs": [1] * 3, "files": ["a", "../b"]}}
+                {"version": 2, "count": 1, "means": {"mins": [0] * 3, "maxs": [1] * 3, "files": ["../b", "a"]}}
             ).encode(),
             "names the file '../b'",
         ),
@@ -317,6 +378,7 @@ def cut(path: Path) -> bytes:
 )
 def test_a_damaged_file_is_refused_in_one_sentence(tmp_path, name, content, words):
     (tmp_path / name).write_bytes(content)
+    words = words.replace("{}", str(tmp_path))
     with pytest.raises(UserError) as error:
         read_scene(tmp_path / name)
     assert words in str(error.value) and "\n" not in str(error.value) and str(tmp_path / name) in str(error.value)
@@ -335,12 +397,65 @@ def test_images_of_a_sog_that_do_not_fit_are_refused(tmp_path):
     with zipfile.ZipFile(path) as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
     meta = json.loads(files["meta.json"])
-    files["meta.json"] = json.dumps(meta | {"count": 10**6}).encode()
+    files["meta.json"] = json.dumps(meta | {"count": 1000}).encode()
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in files.items():
             archive.writestr(name, content)
-    with pytest.raises(UserError, match="of 1000000 pixels"):
+    with pytest.raises(UserError, match="of 1000 pixels"):
         read_scene(path)
+
+
+def change_sog(path: Path, change) -> None:
+    """Write the files of a .sog anew, as ``change`` leaves them, packed once more."""
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    change(files)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+
+
+def white(side: int) -> bytes:
+    file = io.BytesIO()
+    Image.new("RGBA", (side, side), "white").save(file, "WEBP", lossless=True)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda files: files.update({"meta.json": files["meta.json"] + b" " * 50_000_000}),
+            "meta.json unpacks to more",
+        ),
+        (lambda files: files.update({"quats.webp": bytes(50_000_000)}), "quats.webp unpacks to more than"),
+        (lambda files: files.update({"quats.webp": white(2000)}), "has 2000 x 2000 pixels"),
+        (
+            lambda files: files.update(
+                {"meta.json": json.dumps(json.loads(files["meta.json"]) | {"count": 10**9}).encode()}
+            ),
+            "promises 1000000000 Gaussians, which do not fit",
+        ),
+    ],
+    ids=["meta.json", "an image's bytes", "an image's pixels", "the count"],
+)
+def test_a_sog_that_unpacks_to_far_more_than_it_holds_is_refused(tmp_path, change, words):
+    path = write(tmp_path / "scene.sog", "sog", random_surfels(count=30))
+    change_sog(path, change)
+    tracemalloc.start()
+    try:
+        with pytest.raises(UserError, match=words):
+            read_scene(path)
+        assert tracemalloc.get_traced_memory()[1] < 4e7
+    finally:
+        tracemalloc.stop()
+
+
+def test_an_unpacked_sog_is_read_from_its_folder(tmp_path):
+    path = write(tmp_path / "scene.sog", "sog", random_surfels(count=30))
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(tmp_path / "scene")
+    assert torch.equal(read_scene(tmp_path / "scene").gaussians.means, read_scene(path).gaussians.means)
 
 
 def test_a_ply_is_read_as_what_it_is_whatever_its_name(tmp_path):

@@ -39,7 +39,7 @@ def format_of(path: Path, scene: ImportedScene) -> FileFormat:
         kernel = "surflet" if "surflets" in kind else "ellipsoid"
         return FileFormat("usda-splats" if path.suffix.lower() == ".usda" else "usdz-splats", {"kernel": kernel})
     names = {"3DGS .ply": "ply", "2DGS .ply": "ply-2dgs", "compressed .ply": "compressed-ply"}
-    names |= {".sog": "sog", ".sog of discs": "sog", "glTF of splats": "gltf-splats"}
+    names |= {".sog": "sog", ".sog of discs": "sog", ".splat": "splat", "glTF of splats": "gltf-splats"}
     if (name := names.get(kind)) is not None:
         return FileFormat(name, {})
     return FileFormat("ply", {}, f"A {kind} is not written, so a .ply of 3DGS is.")

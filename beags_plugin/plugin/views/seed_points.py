@@ -56,7 +56,7 @@ def starting_points(scene: Dataset, views: PosedViews, count: int) -> dict[str, 
 
 
 def _read(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read positions [N, 3] float64 and colours [N, 3] uint8 of a file; points whose places are no numbers are left out.
+    """Read positions [N, 3] float64 and colours [N, 3] uint8 of a file, without points whose places are no numbers.
 
     Raises ``UserError`` for a file of another kind, or where no point is left of some.
     """

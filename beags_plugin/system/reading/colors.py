@@ -39,22 +39,34 @@ def as_bytes(colors: np.ndarray) -> np.ndarray:
     """
     if colors.dtype.itemsize == 1:
         return np.ascontiguousarray(colors).view(np.uint8).reshape(colors.shape)
+    values, most = range_of(colors)
+    if most is None:
+        return np.full(values.shape, GREY, np.uint8)
+    known = np.isfinite(values).all(axis=1)
+    scaled = np.clip(np.where(known[:, None], values, GREY / 255.0 * most) * (255.0 / most) + 0.5, 0, 255)
+    return scaled.astype(np.uint8)
+
+
+def range_of(colors: np.ndarray) -> tuple[np.ndarray, float | None]:
+    """Return colours [N, C] as float64, and the number that stands for 1; None if they fit no range, or none is there.
+
+    See ``as_bytes``.
+    """
     whole = colors.dtype.kind in "iu"
-    values = colors.astype(np.float64)
+    values = (colors.view(np.uint8) if colors.dtype.kind == "i" and colors.dtype.itemsize == 1 else colors).astype(
+        np.float64
+    )
+    if colors.dtype.itemsize == 1:
+        return values, 255.0
     if whole and colors.dtype.itemsize == 2:
         values[values < 0] += 65536  # 16 bits that lack the word unsigned
     known = np.isfinite(values).all(axis=1)
     if not known.any():
-        return np.full(values.shape, GREY, np.uint8)
+        return values, None
     least, most = np.quantile(values[known], [1.0 - _MOST, _MOST])
     highest = values[known].max()
     if not whole and least >= -0.05 and most <= 1.05:
-        factor = 255.0
-    elif least >= (0.0 if whole else -1.0) and (highest <= 255.0 or (not whole and most <= 256.0)):
-        factor = 1.0
-    elif least >= 0.0 and most <= 65535.0:
-        factor = 255.0 / 65535.0
-    else:
-        return np.full(values.shape, GREY, np.uint8)
-    scaled = np.clip(np.where(known[:, None], values, GREY / factor) * factor + 0.5, 0, 255)
-    return scaled.astype(np.uint8)
+        return values, 1.0
+    if least >= (0.0 if whole else -1.0) and (highest <= 255.0 or (not whole and most <= 256.0)):
+        return values, 255.0
+    return values, 65535.0 if least >= 0.0 and most <= 65535.0 else None

@@ -13,7 +13,7 @@ import numpy as np
 
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.colors import colors_of
-from beags_plugin.system.reading.stand_ins import stand_in
+from beags_plugin.system.reading.stand_ins import stand_in, starts_as
 from beags_plugin.system.reading.text import number_of, reason
 
 _HEADER_BYTES = 1 << 20  # a header is longer than this in no file that is one
@@ -109,7 +109,7 @@ def write_vertices(file: BinaryIO, table: np.ndarray, comment: str = "") -> None
 def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read positions [N, 3] float64 and colours [N, 3] uint8 (mid-grey if there are none) of a .ply's vertices.
 
-    Positions are as they are, finite or not. Raises ``UserError`` if the file is absent or has no vertices with x, y, z.
+    Positions are as they are, finite or not. Raises ``UserError`` if the file is absent or has no x, y, z.
     """
     if not path.is_file():
         raise UserError(f"the seed points {path} (ply_file_path) do not exist: restore the file or remove the key.")
@@ -146,7 +146,8 @@ def _read_header(path: Path) -> _Header:
         head = file.read(_HEADER_BYTES)
     feed = next((end for end in (b"\r\n", b"\n", b"\r") if head.startswith(b"ply" + end)), None)
     if feed is None or (feed + b"end_header") not in head:
-        raise ValueError(stand_in(path) or "it does not start with a .ply header")
+        other = None if head.startswith(b"ply") else starts_as(path)
+        raise ValueError(stand_in(path) or other or "it does not start with a .ply header")
     text, mark, rest = head.partition(feed + b"end_header")
     body = len(text) + len(mark) + (len(feed) if rest.startswith(feed) else 0)
     order, elements = None, []

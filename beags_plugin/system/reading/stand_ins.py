@@ -1,4 +1,4 @@
-"""Files that stand in place of data: pointers of Git LFS and git-annex, web pages, and files without bytes."""
+"""Files that stand in place of data: pointers of Git LFS and git-annex, web pages, files without bytes or misnamed."""
 
 from __future__ import annotations
 
@@ -12,6 +12,24 @@ _LFS = b"version https://git-lfs.github.com/spec/"
 _ANNEX = re.compile(rb"^(?:\.\./|/)*\.?git/annex/objects/|^/annex/objects/")
 _XML = re.compile(rb"^\s*<\?xml[^>]*\?>\s*<(?:Error|Code)\b")  # what storage services answer in place of a file
 _PAGE = re.compile(rb"^\s*(?:<!--.*?-->\s*)*(?:<!doctype\s+html|<html\b|<head\b|<body\b)", re.IGNORECASE | re.DOTALL)
+
+
+_STARTS = (
+    (b"ply\n", "a .ply"), (b"ply\r", "a .ply"), (b"PK\x03\x04", "a zip, as .sog and .usdz are"),
+    (b"\x1f\x8b", "packed by gzip, as .spz is"), (b"glTF", "a .glb"), (b"#usda", "a .usda"), (b"PXR-USDC", "a .usdc"),
+    (b"\x89PNG", "a PNG"), (b"\xff\xd8\xff", "a JPEG"), (b"7z\xbc\xaf", "packed by 7-Zip"),
+    (b"\x28\xb5\x2f\xfd", "packed by zstd"),
+)  # fmt: skip
+
+
+def starts_as(path: Path) -> str | None:
+    """Return what the first bytes of a file say that it is, for the brackets of a sentence; None if they do not."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(8)
+    except OSError:
+        return None
+    return next((f"it starts as {kind}: unpack or rename it" for mark, kind in _STARTS if head.startswith(mark)), None)
 
 
 def stand_in(path: Path | str) -> str | None:
