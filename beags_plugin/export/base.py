@@ -12,6 +12,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.extraction.far_worlds import to_world
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.system.errors import UserError
 
@@ -98,6 +99,13 @@ class Exporter(ABC):
     def unavailable(cls) -> str | None:
         """Return None if this exporter can run here, else one sentence: why not and what to install."""
         return None
+
+    def to_world(self, path: Path, origin: Tensor) -> bool:
+        """Move a file that ``write`` made about ``origin`` [3] float64 to the world, in double precision.
+
+        Returns False, and changes nothing, where the format cannot hold it.
+        """
+        return to_world(path, origin)
 
     @abstractmethod
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor
+
+from beags_plugin.extraction.files import whole_file
 
 UNSIGNED_BYTE, UNSIGNED_SHORT, UNSIGNED_INT, FLOAT = 5121, 5123, 5125, 5126
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
@@ -52,13 +57,26 @@ class Document:
             **({"extensionsUsed": sorted(self.extensions)} if self.extensions else {}),
             "buffers": [{"byteLength": len(self.binary)}],
         }
-        text = json.dumps(content, separators=(",", ":")).encode()
-        text += b" " * (-len(text) % 4)
-        binary = bytes(self.binary)
-        head = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary))
-        return b"".join(
-            [head, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(binary), b"BIN\0"), binary]
-        )
+        return _glb(content, bytes(self.binary))
+
+
+def shifted(content: bytes, offset: Sequence[float]) -> bytes:
+    """Return a .glb of ``Document`` whose top nodes, which are not moved, stand at ``offset``: JSON holds doubles."""
+    (length,) = struct.unpack_from("<I", content, 12)
+    document = json.loads(content[20 : 20 + length])
+    for number in document["scenes"][0]["nodes"]:
+        document["nodes"][number]["translation"] = list(offset)
+    return _glb(document, content[20 + length + 8 :])
+
+
+def _glb(document: dict[str, Any], binary: bytes) -> bytes:
+    """Return a header and two chunks."""
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary))
+    return b"".join(
+        [head, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(binary), b"BIN\0"), binary]
+    )
 
 
 def positions(places: np.ndarray, document: Document) -> int:
@@ -71,3 +89,11 @@ def positions(places: np.ndarray, document: Document) -> int:
 def y_up(vectors: np.ndarray) -> np.ndarray:
     """Return vectors [V, 3] of a frame with z up in one with y up; z of ours is its y, and y its -z."""
     return vectors[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+
+
+def glb_to_world(path: Path, origin: Tensor) -> bool:
+    """Put the nodes of a .glb that was made about ``origin`` [3] float64, z up, where that lies; return True."""
+    content = shifted(path.read_bytes(), y_up(origin.numpy()[None])[0].tolist())
+    with whole_file(path) as part:
+        part.write_bytes(content)
+    return True

@@ -12,12 +12,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from beags_plugin.core.densification import SH_C0
 from beags_plugin.core.surfels import Surfels, opacities
 from beags_plugin.export.base import Exporter, ExportItem
 from beags_plugin.export.glb import add_mesh
-from beags_plugin.export.gltf import FLOAT, UNSIGNED_BYTE, Document, positions
+from beags_plugin.export.gltf import FLOAT, UNSIGNED_BYTE, Document, glb_to_world, positions
 from beags_plugin.export.mesh import TexturedExporter
 from beags_plugin.export.splat_parts import SplatPart, splat_parts, thin_log_scales, without_invented, y_up_surfels
 from beags_plugin.extraction.files import whole_file
@@ -41,6 +42,9 @@ class GltfSplatsExporter(Exporter):
             unfinished.write_bytes(document.to_bytes())
         return {"nodes": len(document.roots)}
 
+    def to_world(self, path: Path, origin: Tensor) -> bool:
+        return glb_to_world(path, origin)
+
 
 @dataclass(frozen=True)
 class GltfBothExporter(TexturedExporter):
@@ -60,6 +64,9 @@ class GltfBothExporter(TexturedExporter):
         with whole_file(path) as unfinished:
             unfinished.write_bytes(document.to_bytes())
         return made.facts() | {"texture": facts}
+
+    def to_world(self, path: Path, origin: Tensor) -> bool:
+        return glb_to_world(path, origin)
 
 
 def add_splats(document: Document, part: SplatPart, name: str = "") -> int:

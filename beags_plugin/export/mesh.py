@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from torch import Tensor
 
 from beags_plugin.export.base import Exporter, ExportItem, NothingToExport
 from beags_plugin.export.closing import Closed, closed
 from beags_plugin.export.fusion import Mesh, decimated, fuse, without_small_parts
 from beags_plugin.export.glb import glb_bytes
+from beags_plugin.export.gltf import glb_to_world
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.placing import Placed, placed
 from beags_plugin.export.surface import area_vectors
@@ -173,6 +175,9 @@ class GlbExporter(TexturedExporter):
         with whole_file(path) as part:
             part.write_bytes(glb_bytes(made.mesh, item.name, texture, made.invented))
         return made.facts() | {"texture": facts}
+
+    def to_world(self, path: Path, origin: Tensor) -> bool:
+        return glb_to_world(path, origin)
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,10 @@ those of splat .ply files. An object that is closed has its closed mesh beside i
 
 from __future__ import annotations
 
+import shutil
 import tempfile
-from collections.abc import Callable
+import zipfile
+from abc import abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -130,14 +132,37 @@ class UsdSplatsExporter(Exporter):
         convex = UsdPhysics.MeshCollisionAPI.Apply(shape.GetPrim())
         convex.CreateApproximationAttr(UsdPhysics.Tokens.convexDecomposition)
 
-    def _write_whole(
-        self, path: Path, item: ExportItem, name: str, content_of: Callable[[Path], bytes]
-    ) -> dict[str, Any]:
-        """Write to ``path`` what ``content_of`` makes of a layer called ``name``; return its facts."""
+    def to_world(self, path: Path, origin: Tensor) -> bool:
+        Gf, Usd, UsdGeom = modules("Gf", "Usd", "UsdGeom")
+        x, y, z = origin.tolist()
+        with tempfile.TemporaryDirectory() as folder:
+            layer = self._unpacked(path, Path(folder))
+            stage = Usd.Stage.Open(str(layer))
+            root = UsdGeom.Xform(stage.GetDefaultPrim())
+            root.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(
+                Gf.Vec3d(x, z, -y) if self.up_axis == "y" else Gf.Vec3d(x, y, z)
+            )
+            stage.GetRootLayer().Save()
+            del stage, root
+            content = self._content(layer)
+        with whole_file(path) as part:
+            part.write_bytes(content)
+        return True
+
+    @abstractmethod
+    def _unpacked(self, path: Path, folder: Path) -> Path:
+        """Return the layer of a file of ours, which lies in ``folder`` then."""
+
+    @abstractmethod
+    def _content(self, layer: Path) -> bytes:
+        """Return the content of the file that holds a layer."""
+
+    def _write_whole(self, path: Path, item: ExportItem, name: str) -> dict[str, Any]:
+        """Write to ``path`` what holds a layer called ``name``; return its facts."""
         with tempfile.TemporaryDirectory() as folder:
             layer = Path(folder) / name
             facts = self._write_layer(layer, item)
-            content = content_of(layer)
+            content = self._content(layer)
         with whole_file(path) as part:
             part.write_bytes(content)
         return facts
@@ -150,7 +175,14 @@ class UsdzSplatsExporter(UsdSplatsExporter):
     suffix: ClassVar[str] = "splats.usdz"
 
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
-        return self._write_whole(path, item, "splats.usdc", packed)
+        return self._write_whole(path, item, "splats.usdc")
+
+    def _unpacked(self, path: Path, folder: Path) -> Path:
+        with zipfile.ZipFile(path) as package:
+            return Path(package.extract("splats.usdc", folder))
+
+    def _content(self, layer: Path) -> bytes:
+        return packed(layer)
 
 
 @dataclass(frozen=True)
@@ -160,7 +192,13 @@ class UsdaSplatsExporter(UsdSplatsExporter):
     suffix: ClassVar[str] = "splats.usda"
 
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
-        return self._write_whole(path, item, "splats.usda", Path.read_bytes)
+        return self._write_whole(path, item, "splats.usda")
+
+    def _unpacked(self, path: Path, folder: Path) -> Path:
+        return Path(shutil.copyfile(path, folder / "splats.usda"))
+
+    def _content(self, layer: Path) -> bytes:
+        return layer.read_bytes()
 
 
 def _collider(item: ExportItem, options: MeshOptions) -> tuple[Closed | None, str]:

@@ -152,7 +152,7 @@ def said_of_far(origin: Tensor, in_world: bool, others: bool) -> str:
     at = ", ".join(f"{value:g}" if abs(value) < 1e6 else f"{value:.0f}" for value in origin.tolist())
     parts = []
     if in_world:
-        parts.append("x, y, z of .ply and .obj files are in double precision")
+        parts.append("places in .ply, .obj, .glb and splats of USD are in double precision")
     if not in_world and not others:
         parts.append(f"the files' origin is the point {at} of it")
     if others:

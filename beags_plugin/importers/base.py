@@ -35,6 +35,7 @@ class ImportedScene:
     note: a sentence that the user should read if the scene is taken to lie in this run's own frame, or "".
     remarks: other sentences for the user: what the format has lost, and what was assumed.
     free_values: whether no specification says what scales and opacities are, and some programs write them activated.
+    exact_means: [N, 3] float64, the means where they lie so far from 0 that single precision tears them; else None.
     doubtful_axes: whether programs disagree on the axes of the format, so that the scene may be a quarter turned.
     """
 
@@ -44,6 +45,7 @@ class ImportedScene:
     note: str = ""
     remarks: tuple[str, ...] = ()
     free_values: bool = False
+    exact_means: Tensor | None = None
     doubtful_axes: bool = False
 
 

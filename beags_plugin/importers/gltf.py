@@ -18,9 +18,8 @@ import numpy as np
 import torch
 
 from beags_plugin.core.flattening import Gaussians
-from beags_plugin.extraction.frames import turned_gaussians
 from beags_plugin.importers.base import ImportedScene, Importer
-from beags_plugin.importers.packed import gaussians_of, joined, moved_by, reading
+from beags_plugin.importers.packed import gaussians_of, in_world, moved_by, reading
 
 EXTENSION = "KHR_gaussian_splatting"
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
@@ -51,8 +50,7 @@ class GltfImporter(Importer):
             if not parts:
                 raise ValueError(f"no primitive of its scene has the extension {EXTENSION}")
             back = _HALF_TURN if "splat-transform" in document.generator.lower() else _Z_UP
-            gaussians = turned_gaussians(joined(parts), back)
-        return ImportedScene("glTF of splats", gaussians, remarks=tuple(dict.fromkeys(remarks)), doubtful_axes=True)
+            return in_world("glTF of splats", parts, back, tuple(dict.fromkeys(remarks)))
 
 
 class _Document:

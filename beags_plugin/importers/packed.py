@@ -17,7 +17,9 @@ from torch import Tensor
 
 from beags_plugin.core.flattening import Gaussians
 from beags_plugin.core.sh import MAX_DEGREE, num_sh_bases
+from beags_plugin.extraction.far_worlds import FAR
 from beags_plugin.extraction.frames import turned_gaussians
+from beags_plugin.importers.base import ImportedScene
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.stand_ins import stand_in, starts_as
 from beags_plugin.system.reading.text import reason
@@ -105,12 +107,36 @@ def joined(parts: Sequence[Gaussians]) -> Gaussians:
     return Gaussians(**{name: torch.cat([values(part, name) for part in parts]) for name in vars(parts[0])})
 
 
-def moved_by(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
-    """Return Gaussians moved by a matrix [4, 4], which turns, shifts and scales alike; else raises ``ValueError``."""
+def moved_by(gaussians: Gaussians, matrix: np.ndarray) -> tuple[Gaussians, Tensor]:
+    """Return Gaussians moved by a matrix [4, 4], which turns, shifts and scales alike; else raises ``ValueError``.
+
+    The second part are their means [N, 3] in float64.
+    """
     linear = matrix[:3, :3]
     factor = float(np.cbrt(np.linalg.det(linear)))
     if not factor > 0 or np.abs(linear @ linear.T / factor**2 - np.eye(3)).max() > _UNEVEN:
         raise ValueError("a node stretches or mirrors its Gaussians: apply its transform where the file was made")
     u, _, vt = np.linalg.svd(linear)
     turned = turned_gaussians(gaussians, torch.from_numpy(u @ vt), factor)
-    return replace(turned, means=(turned.means.double() + torch.from_numpy(matrix[:3, 3].copy())).float())
+    means = factor * (gaussians.means.double() @ torch.from_numpy(u @ vt).T) + torch.from_numpy(matrix[:3, 3].copy())
+    return replace(turned, means=means.float()), means
+
+
+def in_world(
+    kind: str, parts: Sequence[tuple[Gaussians, Tensor]], turn: Tensor | None, remarks: tuple[str, ...]
+) -> ImportedScene:
+    """Return the scene of all parts as ``moved_by`` returns them, turned by ``turn`` [3, 3] float64."""
+    gaussians, means = joined([part for part, _ in parts]), torch.cat([exact for _, exact in parts])
+    if turn is not None:
+        gaussians, means = turned_gaussians(gaussians, turn), means @ turn.T
+    return ImportedScene(kind, gaussians, remarks=remarks, exact_means=_far(means), doubtful_axes=True)
+
+
+def _far(means: Tensor) -> Tensor | None:
+    """Return means [N, 3] float64 that lie far from 0 for their extent; None for others."""
+    known = means[means.isfinite().all(dim=1)]
+    if not len(known):
+        return None
+    middle = known.median(dim=0).values
+    spread = (known - middle).abs().median()
+    return means if float(middle.abs().max()) > FAR * float(spread) else None

@@ -5,6 +5,7 @@ All fields of the stage are taken, each where its transforms put it, and the sce
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar
@@ -14,9 +15,8 @@ import torch
 
 from beags_plugin.core.flattening import Gaussians
 from beags_plugin.core.sh import num_sh_bases
-from beags_plugin.extraction.frames import turned_gaussians
 from beags_plugin.importers.base import ImportedScene, Importer
-from beags_plugin.importers.packed import cut_bands, gaussians_of, joined, moved_by, reading
+from beags_plugin.importers.packed import cut_bands, gaussians_of, in_world, moved_by, reading
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.stand_ins import stand_in
 
@@ -57,13 +57,14 @@ class UsdImporter(Importer):
                 highest = max(highest, degree)
             if not found:
                 raise ValueError("it has no particle field with places: OpenUSD 26.03 and later write them")
-            gaussians = joined(found)
-            if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
-                gaussians = turned_gaussians(gaussians, _Z_UP)
-        if flat == {True}:
-            gaussians = Gaussians(**{**vars(gaussians), "log_scales": gaussians.log_scales[:, :2].contiguous()})
-        kind = "USD of surflets" if flat == {True} else "USD of splats"
-        return ImportedScene(kind, gaussians, remarks=cut_bands(highest), doubtful_axes=True)
+            kind = "USD of surflets" if flat == {True} else "USD of splats"
+            turn = _Z_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else None
+            scene = in_world(kind, found, turn, cut_bands(highest))
+        if flat != {True}:
+            return scene
+        return replace(
+            scene, gaussians=replace(scene.gaussians, log_scales=scene.gaussians.log_scales[:, :2].contiguous())
+        )
 
 
 def _gaussians(prim: Any) -> tuple[Gaussians, int]:

@@ -18,7 +18,7 @@ from beags_plugin.export.frames import Frame, check_placement
 from beags_plugin.export.mesh import open3d_missing
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.pose_options import PoseOptions
-from beags_plugin.extraction.far_worlds import local_origin, said_of_far, to_world, unlist, write_origin
+from beags_plugin.extraction.far_worlds import local_origin, said_of_far, unlist, write_origin
 from beags_plugin.extraction.files import whole_file
 from beags_plugin.plugin.objects.export_job import ExportJob, Progress, Shown, Steps
 from beags_plugin.plugin.objects.exported import Exported, ExportedFile
@@ -223,7 +223,7 @@ def export_shown(
         in_metres=bool(scale_by),
     )  # fmt: skip
     exporter.write(path, item)
-    if origin is not None and (scale_by or not to_world(path, origin)):
+    if origin is not None and (scale_by or not exporter.to_world(path, origin)):
         write_origin(path.parent, origin, [path.name])
     return path
 

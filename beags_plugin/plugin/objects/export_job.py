@@ -16,7 +16,6 @@ from beags_plugin.export.frames import Frame, bounding_box
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.pose_options import PoseOptions
 from beags_plugin.export.standing import turn_to_z
-from beags_plugin.extraction.far_worlds import to_world
 from beags_plugin.extraction.select import select_class
 from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.plugin.objects.clean import Cleaner
@@ -189,7 +188,7 @@ class ExportJob:
         try:
             facts = exporter.write(path, item)
             if self.shift is not None:
-                in_world = to_world(path, self.shift)
+                in_world = exporter.to_world(path, self.shift)
                 facts = {**facts, **({"coordinates": "world"} if in_world else {"origin": self.shift.tolist()})}
             return ExportedFile(label, path, facts)
         except NothingToExport as error:

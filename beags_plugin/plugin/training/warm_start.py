@@ -52,20 +52,19 @@ def start_from_scene(model: SceneModel, datamanager: BeagsDataManager, run: Path
         raise UserError(f"{path} holds no Gaussian that can be used: name another scene.")
     surfels, lost = flatten(scene.gaussians[usable])
     surfels = without_empty_bands(surfels)
-    placed = _placed(path, scene)
-    means = None if placed is None else placed[usable]
+    surfels, shift = _placed(path, scene, usable, surfels)
     outputs = datamanager.train_dataparser_outputs
     ours = (outputs.dataparser_transform, float(outputs.dataparser_scale))
     views = datamanager.views("train")
     frames: Sequence[StartFrame] = ("auto", "world", "normalised")
     frames = frames if config.start_frame == "auto" else (config.start_frame,)
-    candidates: dict[StartFrame, Surfels] = {name: _moved(surfels, scene, name, ours, means) for name in frames}
+    candidates: dict[StartFrame, Surfels] = {name: _moved(surfels, scene, name, ours, shift) for name in frames}
     frame = frames[0]
     fit, turn = _measure(model, candidates[frame], views), ""
     if scene.doubtful_axes and _poor(fit):
         words, turned, found = turned_to_fit(
             surfels,
-            lambda scene_turned: _moved(scene_turned, scene, frame, ours),
+            lambda scene_turned: _moved(scene_turned, scene, frame, ours, shift),
             lambda scene_moved: _measure(model, scene_moved, views, most=8)["psnr"],
         )
         if found > fit["psnr"] + _BETTER_DB:
@@ -106,31 +105,36 @@ def _frame_name(frame: StartFrame, scene: ImportedScene) -> str:
     return "world" if scene.normalization is None else "normalised as its own run"
 
 
-def _placed(path: Path, scene: ImportedScene) -> Tensor | None:
-    """Return the positions [N, 3] float64 of a scene in a world far from 0; None if the scene's own do."""
-    means = scene.gaussians.means
-    if (exact := double_means(path, len(means))) is not None:
-        return exact
-    origin = origin_of(path) if path.is_file() else None
-    return None if origin is None else means.double() + origin
+def _placed(path: Path, scene: ImportedScene, usable: Tensor, surfels: Surfels) -> tuple[Surfels, Tensor | None]:
+    """Return the surfels of the ``usable`` [N] Gaussians, and where 0 of their file lies, [3] float64, or None for 0.
+
+    Those of a world far from 0 whose file has places in double precision are in float64.
+    """
+    exact = scene.exact_means if scene.exact_means is not None else double_means(path, len(usable))
+    if exact is not None:
+        return replace(_double(surfels), means=exact[usable].to(surfels.means.device)), None
+    return surfels, origin_of(path) if path.is_file() else None
+
+
+def _double(surfels: Surfels) -> Surfels:
+    return Surfels(**{field.name: getattr(surfels, field.name).double() for field in fields(surfels)})
 
 
 def _moved(
-    surfels: Surfels, scene: ImportedScene, frame: StartFrame, ours: Normalization, means: Tensor | None = None
+    surfels: Surfels, scene: ImportedScene, frame: StartFrame, ours: Normalization, shift: Tensor | None = None
 ) -> Surfels:
-    """Return the Gaussians in the frame of this run, x' = scale (R x + t) of the input's x.
+    """Return the Gaussians in the frame of this run, x' = scale (R x + t) of the input's x, in float32.
 
-    means: [N, 3] float64, where single precision does not do for those of the surfels; in the input's world.
+    shift: [3] float64, where 0 of their frame lies in the input's world; None for 0.
     """
     theirs = scene.normalization
-    if frame == "normalised" or (frame == "auto" and (scene.note or _same(theirs, ours))):
-        return surfels
-    moved = Surfels(**{field.name: getattr(surfels, field.name).double() for field in fields(surfels)})
-    if means is not None:
-        moved = replace(moved, means=means)
-    if frame == "auto" and theirs is not None:
-        moved = to_input_frame(moved, *theirs)
-    moved = from_input_frame(moved, *ours)
+    moved = _double(surfels)
+    if not (frame == "normalised" or (frame == "auto" and (scene.note or _same(theirs, ours)))):
+        if shift is not None:
+            moved = replace(moved, means=moved.means + shift.to(moved.means.device))
+        if frame == "auto" and theirs is not None:
+            moved = to_input_frame(moved, *theirs)
+        moved = from_input_frame(moved, *ours)
     return Surfels(**{field.name: getattr(moved, field.name).float() for field in fields(moved)})
 
 
