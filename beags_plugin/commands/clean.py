@@ -113,7 +113,9 @@ def figures(start: dict[str, Any], metrics: RunMetrics) -> list[str]:
     """Return the lines of the report on quality."""
     lost = start["flattening"]
     shape = "discs already" if lost is None else f"flattened: thinnest scale {lost['median_ratio']:.3f} of the second"
-    lines = [f"as it came ({shape}): {start['psnr']:.2f} dB in {start['views']} training views"]
+    held_out = start.get("held_out")
+    seen = f", {held_out['psnr']:.2f} dB in {held_out['views']} held-out views" if held_out else ""
+    lines = [f"as it came ({shape}): {start['psnr']:.2f} dB in {start['views']} training views{seen}"]
     stages = (metrics.before, "before refinement, held-out views"), (metrics.after, "after it")
     for found, words in stages:
         if found is None:

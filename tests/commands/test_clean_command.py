@@ -15,6 +15,7 @@ from written_splats import read_back, write
 
 pytest.importorskip("nerfstudio")
 
+import beags_plugin.commands.made_scene as made_scenes
 from beags_plugin.commands.cli import main
 from beags_plugin.export.closing_surfels import joined
 from beags_plugin.importers.base import read_scene
@@ -42,6 +43,7 @@ def test_a_scene_is_refined_and_written_back_in_its_format(tmp_path, monkeypatch
     before, after = scene.surfels.means, cleaned.gaussians.means
     assert torch.cdist(after, before).amin(dim=1).median() < 0.02
     out = " ".join(capsys.readouterr().out.split())
+    assert report["start"]["held_out"]["psnr"] > 40 and f"dB in {report['start']['held_out']['views']} held-out" in out
     assert "75 Gaussians became" in out and "as it came (flattened: thinnest scale" in out and "after it: " in out
     psnr = report["metrics"]["psnr"]
     assert psnr["before"] > 30 and psnr["after"] > 30
@@ -51,6 +53,25 @@ def test_a_scene_is_refined_and_written_back_in_its_format(tmp_path, monkeypatch
     with pytest.raises(SystemExit):
         main(["clean", "my scene.spz", "--data", "data", "--output", "mine"])
     assert "is not of beags clean" in " ".join(capsys.readouterr().out.split())
+
+
+def test_masks_are_made_where_there_are_none_and_gaussians_with_volume_are_polished(tmp_path, monkeypatch, capsys):
+    """As from photos that have poses alone; what stands out in them is found by a source of masks, here a given one."""
+    monkeypatch.chdir(tmp_path)
+    scene = write_start_scene(tmp_path / "data")
+    (tmp_path / "made").mkdir()
+    (tmp_path / "data/masks").rename(tmp_path / "made/masks")
+    asked = []
+    monkeypatch.setattr(made_scenes, "check_source", lambda: None)
+    monkeypatch.setattr(made_scenes, "made_masks", lambda *where: asked.append(where) or tmp_path / "made")
+    write(tmp_path / "scene.ply", "ply", scene.surfels)
+    main(["clean", "scene.ply", "--data", "data", "--output", "out", "--polish", "2", "--steps", "2"])
+    report = json.loads(Path("out/clean.json").read_text())
+    assert asked == [(Path("data"), Path("out/made"))] and report["polish"] == 2
+    assert report["start"]["flattening"]["median_ratio"] == pytest.approx(1e-3, rel=1e-3)
+    assert report["metrics"]["psnr"]["before"] > 30  # after the polish
+    assert read_scene(Path("out/scene.cleaned.ply")).kind == "3DGS .ply"
+    assert "were split and" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize(
@@ -93,7 +114,21 @@ def test_changes_are_counted_by_nearest_neighbours():
     halves = before[2:3]
     after = joined(replace(before, means=moved)[torch.arange(75) != 5], replace(halves, means=halves.means + 0.01))
     found = changes(before, after)
-    assert (found.before, found.after, found.new, found.gone) == (75, 75, 75 - found.kept, 75 - found.kept)
+    assert (found.before, found.after) == (75, 75)
+    assert found.new == found.split + found.dropped == 75 - found.kept and found.dropped >= 1
     assert found.kept in (73, 74) and found.moved <= 1 and found.median == 0
     assert "75 Gaussians became 75" in str(found)
-    assert changes(before[:0], after).new == 75 and changes(before, after[:0]).gone == 75
+    assert changes(before[:0], after).new == 75 and changes(before, after[:0]).dropped == 75
+
+
+def test_what_is_split_is_told_from_what_is_dropped():
+    before, _ = discs()
+    sizes = before.log_scales.exp().amax(dim=1, keepdim=True)
+    one, shift = before[:1], torch.tensor([[1.0, 0.0, 0.0]])
+    halves = [replace(one, means=one.means + sign * 0.5 * sizes[0] * shift) for sign in (1, -1)]
+    far = before.means.clone()
+    far[1:] += 100.0 * torch.arange(1, 75)[:, None]  # neighbours out of reach
+    spread = replace(before, means=far)
+    found = changes(spread, joined(joined(halves[0], halves[1]), spread[2:]))
+    assert (found.before, found.after, found.moved) == (75, 75, 0)
+    assert found.dropped == 1 and found.split + found.kept == 74 and found.new == 75 - found.kept

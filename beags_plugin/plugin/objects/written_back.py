@@ -18,6 +18,8 @@ from beags_plugin.extraction.files import whole_file
 from beags_plugin.importers.base import ImportedScene
 from beags_plugin.plugin.objects.export import export_run
 
+_SPLIT = 2.0  # standard deviations from a Gaussian within which its halves lie
+
 
 @dataclass(frozen=True)
 class FileFormat:
@@ -75,7 +77,8 @@ class Changes:
     """What refinement did to N Gaussians, of which M are left or new.
 
     kept: pairs that are each other's nearest. moved: of these, by more than the Gaussian's own larger scale. median: of
-    their way over that scale. new: others after, split off or added. gone: others before, dropped or split.
+    their way over that scale. split: Gaussians that are gone, in whose place new ones lie. dropped: others that are
+    gone. new: those after that are no former ones.
     """
 
     before: int
@@ -83,27 +86,29 @@ class Changes:
     kept: int
     moved: int
     median: float
+    split: int
+    dropped: int
     new: int
-    gone: int
 
     def __str__(self) -> str:
         """Return a line for users."""
         return (
             f"{self.before:,} Gaussians became {self.after:,}: {self.kept:,} were kept, of which {self.moved:,} moved "
-            f"by more than their size; {self.new:,} were split off or added, and {self.gone:,} split or dropped"
+            f"by more than their size, {self.split:,} were split and {self.dropped:,} dropped; {self.new:,} are new"
         )
 
 
 def changes(before: Surfels, after: Surfels) -> Changes:
     """Compare two states of one scene.
 
-    Nothing numbers Gaussians across splits: those that are each other's nearest by their means count as the same.
+    Nothing numbers Gaussians across splits: those that are each other's nearest by their means count as the same. One
+    that is gone was split if a new one lies within two standard deviations of its larger scale.
     """
     from scipy.spatial import KDTree
 
     first, second = (each.means.detach().double().cpu().numpy() for each in (before, after))
     if not len(first) or not len(second):
-        return Changes(len(first), len(second), 0, 0, 0.0, len(second), len(first))
+        return Changes(len(first), len(second), 0, 0, 0.0, 0, len(first), len(second))
     way, there = (np.atleast_1d(found) for found in KDTree(second).query(first))
     back = np.atleast_1d(KDTree(first).query(second)[1])
     same = back[there] == np.arange(len(first))
@@ -111,6 +116,13 @@ def changes(before: Surfels, after: Surfels) -> Changes:
     relative = way[same] / np.maximum(sizes[same], 1e-300)
     kept = int(same.sum())
     median = float(np.median(relative)) if kept else 0.0
+    new = np.ones(len(second), bool)
+    new[there[same]] = False
+    split = 0
+    if new.any() and not same.all():
+        apart = np.atleast_1d(KDTree(second[new]).query(first[~same])[0])
+        split = int((apart <= _SPLIT * sizes[~same]).sum())
+    gone = len(first) - kept
     return Changes(
-        len(first), len(second), kept, int((relative > 1.0).sum()), median, len(second) - kept, len(first) - kept
+        len(first), len(second), kept, int((relative > 1.0).sum()), median, split, gone - split, len(second) - kept
     )

@@ -86,6 +86,8 @@ def start_from_scene(model: SceneModel, datamanager: BeagsDataManager, run: Path
         "remarks": list(scene.remarks),
         **fit,
     }
+    if held_out := datamanager.views("eval"):
+        report["held_out"] = _measure(model, candidates[frame], held_out)
     for line in _description(path, scene, report):
         CONSOLE.print(f"  {line}", markup=False, highlight=False, soft_wrap=True)
     if _poor(fit):
