@@ -73,12 +73,16 @@ def run_demo(
         CONSOLE.print(
             "The photos contradict each other outside the masks, as on a turntable: now with the objects' pixels alone."
         )
-        _train_once(scene, output, alone, fresh)
+        _train_once(scene, output, alone, fresh, replace=True)
     measure(run, output, seconds)
 
 
-def _train_once(scene: MadeScene, output: Path, request: dict[str, Any], fresh: bool) -> None:
-    """Train what is requested, unless that was done before, or resume it."""
+def _train_once(scene: MadeScene, output: Path, request: dict[str, Any], fresh: bool, replace: bool = False) -> None:
+    """Train what is requested, unless that was done before, or resume it.
+
+    replace: the run that lies there is a step on the way to this one. Raises ``UserError`` where another run, trained
+    to its end, would be replaced.
+    """
     run = output / "run"
     if not fresh and _trained(output, request):
         CONSOLE.print(f"Trained before: {run} (add --fresh to train again).")
@@ -90,6 +94,11 @@ def _train_once(scene: MadeScene, output: Path, request: dict[str, Any], fresh: 
     if not fresh and _interrupted(output, request):
         resume(run)
     else:
+        if (run / "training.json").exists() and not (fresh or replace):
+            raise UserError(
+                f"{run} holds a run that was trained {_difference(_read_stamp(output), request)}: add --fresh to "
+                "replace it, or choose another --output."
+            )
         shutil.rmtree(run, ignore_errors=True)
         write_stamp(output, {STARTED: request})
         train(scene, run, request["preset"], request["downscale"], request.get("photos", "all"))
@@ -131,6 +140,15 @@ def _trained(output: Path, request: dict[str, Any]) -> bool:
     """Return whether the same request was trained before, to its end."""
     former = _read_stamp(output)
     return request in (former, former.get(STARTED)) and (output / "run" / "training.json").exists()
+
+
+def _difference(stamp: dict[str, Any], request: dict[str, Any]) -> str:
+    """Return in which way an earlier request, as its stamp holds it, differs from ``request``."""
+    former = stamp.get(STARTED, stamp)
+    for name, flag in (("preset", "--preset"), ("downscale", "--downscale")):
+        if former.get(name) != request.get(name):
+            return f"with {flag} {former.get(name)}"
+    return "from other data or by another version"
 
 
 def _interrupted(output: Path, request: dict[str, Any]) -> bool:

@@ -78,7 +78,7 @@ def test_a_damaged_stamp_means_not_trained(tmp_path):
 
 
 def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
-    """A demo killed in the training resumes; after the training, it measures; with another request, it starts anew."""
+    """A demo killed in the training resumes; after the training, it measures; another request replaces nothing unasked."""
     data, output = write_scene(tmp_path / "data"), tmp_path / "out"
     run, commands, measured = output / "run", [], []
 
@@ -110,7 +110,10 @@ def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
     assert again() == ("resume", 2)  # which is killed
     assert again() == ("resume", 3) and measured == [3]  # then the demo is killed
     assert again() == ("resume", 3) and measured == [3, 3]
-    assert again(downscale=2.0) == ("ns-train", 4)
+    with pytest.raises(UserError, match=r"out/run holds a run that was trained with --downscale 1.0: add --fresh"):
+        demo.run_demo(data, output, "beags-tiny", 2.0, 0, False)
+    assert len(commands) == 3 and (run / "training.json").exists()
+    assert again(downscale=2.0, fresh=True) == ("ns-train", 4)
     assert again(fresh=True) == ("ns-train", 5) and again() == ("ns-train", 5)
 
 

@@ -22,6 +22,7 @@ from run_folders import write_scene, write_trained
 
 from beags_plugin.data.transforms_file import read_transforms
 from beags_plugin.masks.sources.coco import packed_total
+from beags_plugin.plugin.options.config import config_text
 from beags_plugin.plugin.runs import run_config
 from beags_plugin.plugin.runs.run_config import load_run_config
 from beags_plugin.system.errors import UserError
@@ -86,6 +87,19 @@ def test_configs_of_runs_are_read_as_nerfstudio_reads_them(config):
 
     text = config.read_text("utf8")
     assert yaml.dump(load_run_config(config)) == yaml.dump(yaml.load(text, Loader=yaml.Loader))
+
+
+def test_paths_in_config_yml_are_words_that_people_edit(config, tmp_path):
+    """Also a long one, with a space; by nerfstudio's loader too."""
+    import yaml
+
+    changed = load_run_config(config)
+    changed.data_config.data = Path("/data/my scene") / ("long_" * 30)
+    text = config_text(changed)
+    assert f"[/data/my scene/{'long_' * 30}]\n" in text and "\n- /\n" not in text
+    (tmp_path / "config.yml").write_text(text.replace("my scene", "your scene"))
+    for read in (load_run_config(tmp_path / "config.yml"), yaml.load(text.replace("my", "your"), Loader=yaml.Loader)):
+        assert read.data_config.data.parent == Path("/data/your scene")
 
 
 def test_every_preset_can_be_read_back(tmp_path):

@@ -47,16 +47,14 @@ def unpack(parcel: bytes, folder: Path) -> None:
 
 def relocate(folder: Path, moved: Mapping[Path, Path]) -> None:
     """Let the configs of the runs below ``folder`` name other places. moved: new places by old ones, both folders."""
-    import yaml
-
-    from beags_plugin.plugin.options.config import CONFIG_FILE
+    from beags_plugin.plugin.options.config import CONFIG_FILE, config_text
     from beags_plugin.plugin.runs.run_config import load_run_config
 
     if not moved:
         return
     moved = dict(sorted(moved.items(), key=lambda pair: -len(pair[0].parts)))  # a folder in another one goes first
     for path in sorted(folder.rglob(CONFIG_FILE)):
-        write_text_atomically(yaml.dump(_relocated(load_run_config(path), moved)), path)
+        write_text_atomically(config_text(_relocated(load_run_config(path), moved)), path)
 
 
 def _relocated(value: Any, moved: Mapping[Path, Path]) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, cast
 
 import torch
@@ -24,6 +24,7 @@ from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.system.errors import UserError, print_user_errors_plainly, writing
 from beags_plugin.system.interrupts import stop
 from beags_plugin.system.lock import lock_ahead, run_lock
+from beags_plugin.system.pasted import quoted
 from beags_plugin.system.registry import load
 from beags_plugin.system.whole_files import write_text_atomically
 
@@ -35,6 +36,22 @@ def _adam_fuses_on_cpus() -> bool:
     """Return whether torch's Adam has the one-pass form on CPUs: from 2.4 on."""
     major, minor = torch.__version__.split(".")[:2]
     return (int(major), int(minor)) >= (2, 4)
+
+
+class _ConfigDumper(yaml.Dumper):
+    """PyYAML's writer of Python objects; a path is one word, which people can read and edit."""
+
+    def path(self, path: PurePath) -> yaml.Node:
+        tag = f"tag:yaml.org,2002:python/object/apply:pathlib.{type(path).__name__}"
+        return self.represent_sequence(tag, [str(path)], flow_style=True)
+
+
+_ConfigDumper.add_multi_representer(PurePath, _ConfigDumper.path)
+
+
+def config_text(config: BeagsTrainerConfig) -> str:
+    """Return the content of config.yml, which nerfstudio's loader reads too."""
+    return yaml.dump(config, Dumper=_ConfigDumper, width=10_000)  # a long path stays on its line
 
 
 @dataclass
@@ -52,6 +69,8 @@ class BeagsTrainerConfig(TrainerConfig):
     prompt: Suppress[str | None] = None  # for fields made from text
     run_dir: Path | None = None
     """Folder of this run; None puts it where nerfstudio does (output_dir/experiment/method/timestamp)."""
+    overwrite: bool = False
+    """Replace the run that lies in the folder; without it, a folder that holds a checkpoint is refused."""
     max_num_iterations: int = 0
     """Step of the schedule to stop after; 0 runs base_steps + refine_steps."""
     steps_per_held_out: int = 0
@@ -120,12 +139,25 @@ class BeagsTrainerConfig(TrainerConfig):
                 rollback.note(run)
             lock_ahead(run)
             try:
+                self._check_place(run)
                 self._save()
             except UserError:
                 rollback.noted(run).undo()
                 raise
         except UserError as error:
             stop(error)
+
+    def _check_place(self, run: Path) -> None:
+        """Raise ``UserError`` where this run would replace the checkpoints of another one."""
+        saved = [*run.glob(f"{self.relative_model_dir}/*.ckpt"), *run.glob(f"{rollback.REPLACED}/*.ckpt")]
+        loaded = self.load_dir or (self.load_checkpoint and Path(self.load_checkpoint).parent)
+        goes_on = loaded is not None and Path(loaded).resolve().parent == run.resolve()
+        if saved and not (goes_on or self.overwrite):
+            raise UserError(
+                f"{run} holds a run: go on with it (beags resume {quoted(run)}), replace it (--overwrite), or choose "
+                "another --run-dir."
+            )
+        self.overwrite = False  # saved, it would hold for every later ns-train --load-config too
 
     def _save(self) -> None:
         self.output_dir = Path(self.output_dir).absolute()
@@ -137,7 +169,7 @@ class BeagsTrainerConfig(TrainerConfig):
                 holder.data = Path(data).absolute()
         if (start := self.model_config.start_from) is not None:
             self.model_config.start_from = Path(start).absolute()
-        write_text_atomically(yaml.dump(self), self.get_base_dir() / CONFIG_FILE)
+        write_text_atomically(config_text(self), self.get_base_dir() / CONFIG_FILE)
         if self.machine.num_devices * self.machine.num_machines > 1:  # the training is in processes of its own
             run_lock(self.get_base_dir()).release()
 

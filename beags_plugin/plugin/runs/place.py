@@ -49,6 +49,7 @@ def place_for_nerfstudio(config: BeagsTrainerConfig) -> None:
     if reader == ("nerfstudio.scripts.train", "main"):
         flags = frame.f_locals["config"]
         _place(config, flags.load_config, flags.data)
+        config.overwrite = getattr(flags, "overwrite", False)
     elif reader == ("nerfstudio.utils.eval_utils", "eval_setup"):
         path = Path(frame.f_locals["config_path"])
         print_user_errors_plainly()

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from torch import Tensor
 
-from beags_plugin.plugin.options.config import CONFIG_FILE, BeagsTrainerConfig
+from beags_plugin.plugin.options.config import CONFIG_FILE, BeagsTrainerConfig, config_text
 from beags_plugin.plugin.runs.layout import TRANSFORM_FILE
 from beags_plugin.system.whole_files import write_text_atomically, write_whole
 
@@ -42,7 +41,7 @@ def write_run(config: BeagsTrainerConfig, folder: Path, model_state: dict[str, T
         if old != path:
             old.unlink()
     config_path = folder / CONFIG_FILE
-    write_text_atomically(yaml.dump(own), config_path)
+    write_text_atomically(config_text(own), config_path)
     transform = config.get_base_dir() / TRANSFORM_FILE
     if transform.exists() and transform.parent != folder:
         shutil.copyfile(transform, folder / TRANSFORM_FILE)

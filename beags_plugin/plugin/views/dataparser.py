@@ -26,6 +26,7 @@ from beags_plugin.data.split import split_views
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import NO_TRUTH
 from beags_plugin.plugin.views.cameras import check_cameras, downscaled_size, resize_cameras
+from beags_plugin.plugin.views.ns_train import prepare
 from beags_plugin.plugin.views.placing import Normalization, PlacedOutputs
 from beags_plugin.plugin.views.poses import PosedViews, read_poses
 from beags_plugin.plugin.views.recognised import images_root, recognised
@@ -256,7 +257,12 @@ class BeagsDataParser(DataParser):
         return train if split == "train" else held_out
 
 
-beags_data = DataParserSpecification(
-    config=BeagsDataParserConfig(),
-    description="Scenes with class id images: nerfstudio, COLMAP, LLFF and other layouts (BEA-GS).",
-)
+def __getattr__(name: str) -> DataParserSpecification:
+    """Return the target of nerfstudio's entry point, ``beags_data``, which the first program to ask for it prepares."""
+    if name != "beags_data":
+        raise AttributeError(name)
+    prepare()
+    return DataParserSpecification(
+        config=BeagsDataParserConfig(),
+        description="Scenes with class id images: nerfstudio, COLMAP, LLFF and other layouts (BEA-GS).",
+    )

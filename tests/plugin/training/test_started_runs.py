@@ -62,17 +62,29 @@ def test_ctrl_c_saves_the_step_and_a_resume_goes_on(data, whole, tmp_path, monke
 def test_a_new_run_into_the_folder_of_another_is_not_taken_for_it(data, whole, tmp_path, monkeypatch):
     run = tmp_path / "run"
     run_to_end(short_config(data, run, **{"machine.seed": 7}))
-    interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, 5))
+    interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, 5), overwrite=True)
     assert [path.name for path in (run / "replaced_models").iterdir()] == [f"step-{LAST:09d}.ckpt"]
     resume_to_end(run)
     assert_same_run(run, whole)
     assert not (run / "replaced_models").exists()
 
 
+def test_a_finished_run_is_replaced_only_if_asked_for(data, whole, tmp_path, monkeypatch):
+    run = shutil.copytree(whole, tmp_path / "my run")
+    before = contents(run)
+    with pytest.raises(UserError, match=r"my run holds a run: .*beags resume '.*/my run'.*--overwrite.*--run-dir"):
+        run_to_end(short_config(data, run))
+    assert contents(run) == before
+    interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, 5), overwrite=True)
+    with pytest.raises(UserError, match="holds a run"):  # its checkpoint is in replaced_models
+        run_to_end(short_config(data, run))
+    assert "overwrite: false" in (run / "config.yml").read_text()  # for ns-train --load-config
+
+
 def test_a_refused_start_in_the_folder_of_another_run_changes_nothing_there(data, whole, tmp_path):
     run = shutil.copytree(whole, tmp_path / "run")
     before = contents(run)
-    config = short_config(data, run, **{"pipeline.model.refine_steps": 0})
+    config = short_config(data, run, overwrite=True, **{"pipeline.model.refine_steps": 0})
     config.pipeline.model.start_from = tmp_path / "nothing.ply"
     with pytest.raises(UserError, match="nothing.ply"):
         run_to_end(config)

@@ -1,0 +1,49 @@
+"""What ns-train does with a method of ours before it has imported nerfstudio's own.
+
+nerfstudio loads data parsers of other packages first, long before their methods: so our data parser prepares the rest.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from beags_plugin.system.errors import UserError, check_choice, meant, silence_libraries
+from beags_plugin.system.shipped import shipped_names
+
+
+def prepare() -> None:
+    """Make ns-train of a preset of ours quicker and quieter; end it with one sentence if the preset is misspelt.
+
+    Other programs, and ns-train with other methods, are left as they are.
+    """
+    program, *words = sys.argv
+    name = words[0] if words else ""
+    presets = shipped_names("method_configs")
+    if Path(program).stem != "ns-train" or not (name.startswith("beags") or meant(name, presets)):
+        return
+    try:
+        check_choice(name, presets, "preset")
+    except UserError as error:
+        print(f"beags: {error}", file=sys.stderr)
+        sys.exit(2)
+    silence_libraries()
+    _leave_out_other_methods()
+
+
+def _leave_out_other_methods() -> None:
+    """Spare what nerfstudio does at each start for methods other than the one that has been named.
+
+    It walks over all modules of the process for every method that it could install, and imports torch's compiler for
+    one function of splatfacto.
+    """
+    from nerfstudio.configs import external_methods
+    from nerfstudio.utils import misc
+
+    external_methods.external_methods.clear()
+
+    def plain(*arguments: Any, **_: Any) -> Any:
+        return arguments[0] if arguments else lambda function: function
+
+    misc.torch_compile = plain
