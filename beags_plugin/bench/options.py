@@ -8,6 +8,8 @@ from typing import Annotated
 
 import tyro
 
+from beags_plugin.system.output_option import OUTPUT
+
 
 @dataclass(kw_only=True)
 class EngineOptions:
@@ -38,7 +40,7 @@ class ExperimentOptions(EngineOptions):
     """Which of the experiment's variants to run, besides the one that it compares with; "all", or left out: all."""
     quick: bool = False
     """Try the experiment out in a minute or two: tiny scenes, few steps, figures that mean nothing."""
-    output: Path = Path("outputs/bench")
+    output: Annotated[Path, OUTPUT] = Path("outputs/bench")
     """Folder of scenes, trials and results."""
     json: Path | None = None
     """File for all figures; <output>/<experiment>.json if left out."""

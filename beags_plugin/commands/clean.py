@@ -28,12 +28,19 @@ REPORT, STAMP = "clean.json", "cleaning"  # STAMP: beside the run, marks it as m
 
 
 def clean_scene(
-    path: Path, data: Path, objects: Sequence[str], output: Path | None, polish: int, steps: int | None
+    path: Path,
+    data: Path,
+    objects: Sequence[str],
+    output: Path | None,
+    polish: int,
+    steps: int | None,
+    overwrite: bool = False,
 ) -> None:
     """Refine the scene in ``path`` with the photos and masks in ``data``; write files and a report to ``output``.
 
     objects: names of those that get a file of their own too. polish: base steps before, for a scene of 3D Gaussians.
-    steps: of refinement, the preset's if None. Raises ``UserError``.
+    steps: of refinement, the preset's if None. overwrite: replace a scene that was cleaned there before. Raises
+    ``UserError``.
     """
     from beags_plugin.commands.made_scene import made_scene
     from beags_plugin.importers.base import read_scene
@@ -49,6 +56,8 @@ def clean_scene(
     run = output / "run"
     if run.exists() and not (output / STAMP).exists():
         raise UserError(f"{run} is not of beags clean: choose another --output, or move it away.")
+    if (output / REPORT).exists() and not overwrite:
+        raise UserError(f"{output} holds a cleaned scene: add --overwrite to replace it, or choose another --output.")
     scene = made_scene(data, output)
     check_names(scene, objects)
     shutil.rmtree(run, ignore_errors=True)

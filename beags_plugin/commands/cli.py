@@ -7,7 +7,7 @@ import sys
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import Annotated, Literal, NoReturn
 
 import tyro
 from rich.console import Console
@@ -17,12 +17,14 @@ from beags_plugin.bench.commands import Measurement
 from beags_plugin.commands.masks import Masks
 from beags_plugin.commands.process import Process
 from beags_plugin.commands.starting import check_arguments, starting
+from beags_plugin.commands.view import View
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.pose_options import PoseOptions
 from beags_plugin.export.splat_options import SplatOptions
 from beags_plugin.pictures.options import RenderOptions
 from beags_plugin.system.errors import UserError, refused, silence_libraries
+from beags_plugin.system.output_option import OUTPUT
 from beags_plugin.system.pasted import quoted
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
@@ -39,7 +41,7 @@ class Demo:
 
     data: Path | None = None
     """Folder of a scene or of photos, or a video; the generated sample if left out."""
-    output: Path | None = None
+    output: Annotated[Path | None, OUTPUT] = None
     """Where everything goes; outputs/demo, or outputs/<name of the data>."""
     preset: str | None = None
     """What to train with: a preset of method_configs/; beags-tiny for the sample, beags-fast for data, if left out."""
@@ -85,7 +87,7 @@ class Resume:
 class Sample:
     """Generate a scene with exact ground truth: photos, damaged masks, silhouettes, depth, objects removed."""
 
-    output: Path = Path("outputs/sample")
+    output: Annotated[Path, OUTPUT] = Path("outputs/sample")
     """Folder to write."""
     seed: int = 0
     """Another seed gives another arrangement."""
@@ -131,7 +133,7 @@ class Extract:
     """Names of the objects; all but the background if left out."""
     remove: bool = False
     """Keep everything but the object."""
-    output: Path | None = None
+    output: Annotated[Path | None, OUTPUT] = None
     """Folder for the runs; extracted/ beside config.yml if left out."""
     json: Path | None = None
     """File that lists what was written."""
@@ -153,7 +155,7 @@ class Extract:
         for done in extracted:
             CONSOLE.print(
                 f"{done.name}: {counted_gaussians(done.gaussians, done.left_out)}\n  {done.ply}\n"
-                f"  ns-viewer --load-config {quoted(done.config)}",
+                f"  beags view {quoted(done.config.parent)}",
                 markup=False,
             )
         for sentence in sentences:
@@ -178,7 +180,7 @@ class Export:
     stl, 3mf (to print), or your own."""
     frame: str = "world"
     """world, that of the input poses; or object, the same with the middle of the object's box as origin."""
-    output: Path | None = None
+    output: Annotated[Path | None, OUTPUT] = None
     """Folder for the files; exports/ beside config.yml if left out."""
     json: Path | None = None
     """File that lists what was written."""
@@ -228,17 +230,19 @@ class Clean:
     """Folder of the photos, with the poses in whose world the scene lies, and id masks."""
     object: tuple[str, ...] = ()
     """Names of objects that get a file of their own too."""
-    output: Path | None = None
+    output: Annotated[Path | None, OUTPUT] = None
     """Folder for the files, the report and the run; outputs/<scene>_cleaned if left out."""
     polish: int = 300
     """Base steps before refinement that repair what flattening costs a scene of 3D Gaussians."""
     steps: int | None = None
     """Steps of refinement; those of beags-refine if left out."""
+    overwrite: bool = False
+    """Replace a scene that was cleaned into the same folder before."""
 
     def run(self) -> None:
         with starting(self):
             from beags_plugin.commands.clean import clean_scene
-        clean_scene(self.scene, self.data, self.object, self.output, self.polish, self.steps)
+        clean_scene(self.scene, self.data, self.object, self.output, self.polish, self.steps, self.overwrite)
 
 
 @dataclass
@@ -257,11 +261,11 @@ class Render:
     underlay: bool = False
     """Write <object>/<photo>.png: each object alone over the faded photo, in every held-out view, as large as the
     photo. Draw its silhouette over it, white on black, and beags eval reads it (docs/evaluation.md)."""
-    output: Path | None = None
+    output: Annotated[Path | None, OUTPUT] = None
     """The file (with --underlay the folder); in renders/ beside config.yml if left out."""
     data: Path | None = None
     """Folder of the photos, whose cameras say what is up, if not where the run was trained on them."""
-    options: tyro.conf.OmitArgPrefixes[RenderOptions] = RenderOptions()
+    pictures: tyro.conf.OmitArgPrefixes[RenderOptions] = RenderOptions()
 
     def run(self) -> None:
         if self.underlay:
@@ -271,12 +275,12 @@ class Render:
             from beags_plugin.plugin.objects.render import render_run
         with progress_bar("rendering") as progress:
             path = render_run(
-                self.load_config, self.object, self.format, self.output, self.options, progress, self.data
+                self.load_config, self.object, self.format, self.output, self.pictures, progress, self.data
             )
         CONSOLE.print(f"{self.format}: {path}", markup=False)
 
     def _underlay(self) -> None:
-        if self.format != "video" or self.options != RenderOptions():
+        if self.format != "video" or self.pictures != RenderOptions():
             raise UserError(
                 "an underlay has the cameras and sizes of the held-out photos: give --underlay no other option "
                 "than --load-config, --object, --output and --data."
@@ -368,7 +372,7 @@ def write_json(path: Path | None, content: object) -> None:
         write_text_atomically(json.dumps(content, indent=2, default=str) + "\n", path)
 
 
-Command = Demo | Process | Resume | Sample | Masks | Extract | Export | Clean | Render | Eval | Bench | Doctor
+Command = Demo | Process | Resume | Sample | Masks | View | Extract | Export | Clean | Render | Eval | Bench | Doctor
 
 
 def exit_with(error: UserError) -> NoReturn:

@@ -214,7 +214,7 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
     CONSOLE.print(f"objects: {', '.join(str(item.ply) for item in extracted)}")
     CONSOLE.print(f"figures: {output / 'summary.json'}")
     CONSOLE.print(f"picture: {picture}")
-    CONSOLE.print(f"look:    ns-viewer --load-config {quoted(run / 'config.yml')}")
+    CONSOLE.print(f"look:    beags view {quoted(run)}")
 
 
 @contextmanager

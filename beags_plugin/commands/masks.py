@@ -5,11 +5,13 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from rich.console import Console
 
 from beags_plugin.commands.starting import starting
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.output_option import OUTPUT
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 
@@ -39,7 +41,7 @@ class Check:
     """Ids in the masks that mean "not labelled", if not the run's own."""
     min_views: int = 3
     """An object in fewer training views is reported."""
-    output: Path | None = None
+    output: Annotated[Path | None, OUTPUT] = None
     """Folder for report.json, coverage.png and contradicted.png; outputs/masks_check/<scene's name> if left out."""
 
     def run(self) -> None:
@@ -83,7 +85,7 @@ class Reproject:
     """Work at the size that was trained on instead of that of the photographs: quicker, smaller masks."""
     data: Path | None = None
     """Folder of the photos, if not where the run was trained on them."""
-    output: Path | None = None
+    output: Annotated[Path | None, OUTPUT] = None
     """Folder for masks, confidence, classes.json, report.json, before_after.png; reprojected/ beside config.yml."""
 
     def run(self) -> None:
@@ -116,7 +118,7 @@ class Make:
     """Of the source, as key=value, e.g. prompts=prompts.json."""
     load_config: Path | None = None
     """A run (folder or config.yml) trained on the scene, beags-base will do; for sources that need its depth."""
-    output: Path | None = None
+    output: Annotated[Path | None, OUTPUT] = None
     """Folder for masks/, classes.json and made.png; the scene's own if left out."""
     overwrite: bool = False
     """Replace masks that are there already."""

@@ -5,10 +5,12 @@ from __future__ import annotations
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from rich.console import Console
 
 from beags_plugin.commands.starting import starting
+from beags_plugin.system.output_option import OUTPUT_DIR
 from beags_plugin.system.pasted import command
 from beags_plugin.system.progress import progress_bar
 
@@ -24,7 +26,7 @@ class Process:
 
     data: Path
     """Folder of photos, or a video."""
-    output_dir: Path
+    output_dir: Annotated[Path, OUTPUT_DIR]
     """Folder to write: images/, transforms.json, sparse_pc.ply, colmap/sparse/0, poses.json, poses.png."""
 
     masks: Path | None = None

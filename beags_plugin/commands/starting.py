@@ -56,7 +56,7 @@ def check_arguments(command: Any) -> None:
         LAYOUTS.check(layout, "auto")
     if (source := values.get("source")) is not None:
         MASK_SOURCES.check(source)
-    if isinstance(options := values.get("options"), RenderOptions):
+    if isinstance(options := values.get("pictures"), RenderOptions):
         check_choice(values["format"], get_args(PictureFormat), "format")
         options.check()
     else:

@@ -48,6 +48,9 @@ def test_a_scene_is_refined_and_written_back_in_its_format(tmp_path, monkeypatch
     psnr = report["metrics"]["psnr"]
     assert psnr["before"] > 30 and psnr["after"] > 30
     with pytest.raises(SystemExit):
+        main([*arguments, "class_1"])
+    assert "holds a cleaned scene: add --overwrite" in " ".join(capsys.readouterr().out.split())
+    with pytest.raises(SystemExit):
         main(["clean", "my scene.spz", "--data", "data", "--output", "data", "--polish", "-1"])
     (tmp_path / "mine/run").mkdir(parents=True)
     with pytest.raises(SystemExit):

@@ -78,7 +78,7 @@ def test_a_damaged_stamp_means_not_trained(tmp_path):
 
 
 def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
-    """A demo killed in the training resumes; after the training, it measures; another request replaces nothing unasked."""
+    """A demo killed in the training resumes; after the training, it measures; another request asks first."""
     data, output = write_scene(tmp_path / "data"), tmp_path / "out"
     run, commands, measured = output / "run", [], []
 

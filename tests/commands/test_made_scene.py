@@ -92,7 +92,10 @@ def test_photos_alone_are_trained_on_with_poses_and_masks_once(photos, tmp_path,
     demo.run_demo(photos, tmp_path / "out", None, None, 0, False)
     assert len(trainings) == 1 and files(photos) == before
     write_image(tmp_path / "out/scene/masks/v00.png", np.zeros((240, 320), np.uint8))  # by the user
-    demo.run_demo(photos, tmp_path / "out", None, None, 0, False)
+    with pytest.raises(UserError, match="out/run holds a run that was trained from other data .*--fresh"):
+        demo.run_demo(photos, tmp_path / "out", None, None, 0, False)
+    assert len(trainings) == 1
+    demo.run_demo(photos, tmp_path / "out", None, None, 0, True)
     assert len(trainings) == 2
 
 

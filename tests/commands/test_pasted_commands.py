@@ -15,7 +15,7 @@ pytest.importorskip("nerfstudio")
 from beags_plugin.commands.cli import main
 from beags_plugin.system.errors import UserError
 
-_COMMAND = re.compile(r"(?:\s--[a-z-]+|beags resume|ns-viewer|ns-train|ns-render|git [a-z ]+) (?:[a-z_]+=)?\{(\w+)")
+_COMMAND = re.compile(r"(?:\s--[a-z-]+|beags resume|beags view|ns-train|ns-render|git [a-z ]+) (?:[a-z_]+=)?\{(\w+)")
 SAFE = {"quoted", "command", "address"}  # address: a URL; words in capitals are our own
 
 
@@ -38,8 +38,8 @@ def test_the_viewers_command_of_extracted_objects(tmp_path, capsys):
     folder = tmp_path / "my lab [1] (copy)"
     config = write_trained(folder / "run", write_scene(folder / "scene"))
     main(["extract", "--load-config", str(config), "--object", "cup", "--keep-all"])
-    words = pasted(capsys.readouterr().out, "ns-viewer")
-    assert words[:2] == ["ns-viewer", "--load-config"] and Path(words[2]).is_file() and len(words) == 3
+    words = pasted(capsys.readouterr().out, "beags view")
+    assert words[:2] == ["beags", "view"] and Path(words[2], "config.yml").is_file() and len(words) == 3
 
 
 def test_the_command_after_poses(tmp_path, capsys, monkeypatch):

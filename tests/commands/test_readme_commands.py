@@ -50,7 +50,7 @@ RUN = {  # in this order; the command in README.md: flags that are appended
     f"beags export {CONFIG} --all --format ply glb": "--resolution 24 --output exported",
     "ns-train beags-refine --data my_scene --pipeline.model.start-from scene.ply": SHORT,
     "beags masks reproject --load-config C": "",
-    f"ns-viewer {CONFIG}": "",  # until its page is there
+    "beags view outputs/...": "",  # until its page is there
     f"beags eval {CONFIG} --picture worst.png": "",
     f"beags extract {CONFIG} --object cup": "",
     f"beags render {CONFIG} --object cup --format before-after": "--size 48 --views 2",
@@ -64,7 +64,7 @@ ELSEWHERE = {
     "beags eval --load-config C [C ...]": "a line of it is run",
     "beags extract --load-config C [--object NAME ...] [--remove]": "a line of it is run",
     "beags render --load-config C [--object NAME ...] [--format before-after]": "a line of it is run",
-    "ns-viewer --load-config C": "a line of it is run",
+    "beags view RUN": "a line of it is run",
     "beags clean SCENE --data X": "refines a whole scene; test_clean_command.py runs it",
     "beags process --data PHOTOS_OR_VIDEO --output-dir X": "this scene has no texture; test_process.py runs it",
     "beags bench ablation [--data X ...]": "trains for minutes; test_bench_running.py runs experiments to their tables",
@@ -172,7 +172,7 @@ class Reader:
 
     def views(self, line: str) -> None:
         port = free_port()
-        with self.started(line, f"--viewer.websocket-port {port}") as process:
+        with self.started(line, f"--port {port}") as process:
             self.waits(process, lambda: answers(port))
             process.terminate()
             process.wait(120)
@@ -199,7 +199,7 @@ def test_the_commands_run_in_order(tmp_path, monkeypatch):
         if line.startswith("ns-train beags-fast"):
             reader.trains_and_is_killed(line, more)
             assert not (reader.run / "training.json").exists()
-        elif line.startswith("ns-viewer"):
+        elif line.startswith("beags view"):
             reader.views(line)
         else:
             if "scene.ply" in line:

@@ -25,7 +25,7 @@ from beags_plugin.labels.colors import colorize
 from beags_plugin.system.child_processes import bound
 
 WIDTH, HEIGHT = 640, 400
-MAX_RESOLUTION = 512  # pixels of the longer side, the default of the viewer
+MAX_RESOLUTION = 512  # pixels of the longer side, the default of the viewer of a training
 COLORS = {name: colorize(np.array([[index]]))[0, 0].astype(int) for index, name in CLASSES.items()}
 HEARS = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"  # tests in the background ignore it
 ENTRY = f"{HEARS}; from nerfstudio.scripts.viewer.run_viewer import entrypoint; entrypoint()"  # what ns-viewer runs
@@ -98,7 +98,17 @@ def painted(pixels: np.ndarray, name: str) -> float:
 def sharp(page: Page) -> bool:
     """Return whether the picture has the full resolution; coarse ones, which the panel shows too, come before it."""
     found = re.search(r"Resolution: (\d+)x(\d+)px", page.text())
-    return found is not None and max(int(found[1]), int(found[2])) == MAX_RESOLUTION
+    if found is None:
+        return False
+    trains = re.search("(Pause|Resume) Training", page.text())
+    longest = MAX_RESOLUTION if trains else max(canvas_size(page))
+    return abs(max(int(found[1]), int(found[2])) - longest) <= 1
+
+
+def canvas_size(page: Page) -> tuple[int, int]:
+    """Return width and height of the canvas that the picture fills, pixels of the page."""
+    canvas = "document.querySelector('canvas[data-engine]')"
+    return tuple(page.evaluate(f"[{canvas}.clientWidth, {canvas}.clientHeight]"))
 
 
 STILL = 1.0  # seconds that a picture must stay as it is: the page names its size before it has decoded it

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from beags_plugin.bench.options import EngineOptions
+from beags_plugin.system.output_option import OUTPUT
 
 
 @dataclass
@@ -30,7 +32,7 @@ class CapturesOptions(EngineOptions):
     """Most pixels of a photo's longer side; larger photos are divided."""
     quick: bool = False
     """Try it out: the first capture, photos of 130 pixels, few steps, figures that mean nothing."""
-    output: Path = Path("outputs/captures")
+    output: Annotated[Path, OUTPUT] = Path("outputs/captures")
     """Folder of made masks, trials and results; a second call goes on where the first ended."""
     json: Path | None = None
     """File for all figures; <output>/captures.json if left out."""

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from beags_plugin.bench.options import EngineOptions
+from beags_plugin.system.output_option import OUTPUT
 
 
 @dataclass
@@ -26,7 +28,7 @@ class PaperOptions(EngineOptions):
     """Divide the paper's image sizes by this; figures are then not the paper's."""
     quick: bool = False
     """Try it out: small photos, few steps, figures that mean nothing."""
-    output: Path = Path("outputs/paper")
+    output: Annotated[Path, OUTPUT] = Path("outputs/paper")
     """Folder of trials and results; a second call goes on where the first ended."""
     json: Path | None = None
     """File for all figures; <output>/paper.json if left out."""

@@ -26,6 +26,8 @@ from beags_plugin.rasterizers.interface import Rasterizer
 
 Progress = Callable[[int, int], None]
 
+_PLAIN_NAMES = ("scene", "turned")  # of the folders that beags demo makes
+
 
 def evaluate_run(
     config_path: Path, protocol: Protocol | None = None, *, name: str = "", progress: Progress | None = None
@@ -149,6 +151,7 @@ class EvaluatedRun:
 
 
 def scene_name(config: BeagsTrainerConfig) -> str:
-    """Return the name of the run's data folder."""
-    data = config.data_path
-    return data.stem if data.suffix == ".json" else data.name
+    """Return the name of the folder of the run's data; of the one above, where it is called as every scene could be."""
+    folder = config.data_path.absolute()
+    folder = folder.parent if folder.suffix == ".json" else folder
+    return folder.parent.name if folder.name in _PLAIN_NAMES and folder.parent.name else folder.name

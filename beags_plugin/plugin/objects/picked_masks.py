@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 from beags_plugin.core.membership import Membership
 from beags_plugin.labels.class_ids import BACKGROUND
@@ -11,43 +13,76 @@ from beags_plugin.picking.source import DrawnSource
 from beags_plugin.plugin.objects.check_masks import options_beside
 from beags_plugin.plugin.objects.make_masks import make_masks
 from beags_plugin.plugin.runs.place import open_run
+from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.system.digests import content_digest
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.pasted import command, quoted
+from beags_plugin.system.pasted import command
 from beags_plugin.system.whole_files import write_text_atomically
 
 STAMP = "masks_picked.txt"  # beside masks that were picked: a digest of them, which shows whether they were mended
 FOLDER = "picked"  # in the run, for masks that must not replace the scene's
 
 
-def save_masks(config_path: Path, members: Membership, names: Mapping[int, str]) -> list[str]:
-    """Write masks of all training views and classes.json; return sentences on where, and on how to refine with them.
+@dataclass(frozen=True)
+class SavedMasks:
+    """Masks that were written: sentences on where, and the command that refines with them."""
 
-    They go to the scene's folder, where ``beags-data`` looks for them; but if that has masks or class names which were
-    not written here, or have been changed since, to ``picked/`` of the run, or ``picked_2/``, ... Nothing but unchanged
-    masks of an earlier call is replaced. config_path: of the run. members: of its Gaussians. Raises ``UserError`` if
-    there is no object, or where files cannot be written.
+    said: str
+    command: str
+
+
+def masks_folder(run: Path) -> Path:
+    """Return the folder beside a run that takes its next masks: ``picked``, or ``picked_2`` and so on.
+
+    A folder with masks that were not written by ``save_masks``, or have been changed since, is left alone.
+    """
+    numbers = range(2, 1000)
+    return next((place for place in [run / FOLDER, *(run / f"{FOLDER}_{n}" for n in numbers)] if _free(place)), run)
+
+
+def save_masks(
+    config_path: Path, members: Membership, names: Mapping[int, str], folder: Path | None = None
+) -> SavedMasks:
+    """Write masks of all training views, classes.json and made.png.
+
+    config_path: of the run. members: of its Gaussians. folder: for the masks; that of ``masks_folder`` if None. Raises
+    ``UserError`` if there is no object, where files cannot be written, and for a folder with masks that were not
+    written here, or have been changed since.
     """
     if not any(class_id != BACKGROUND for class_id in members.present()):
         raise UserError("nothing has been picked yet: click on an object first.")
     run, data = config_path.parent, options_beside(config_path, None)
     scene = Path(data.data).absolute()
     scene = scene if scene.is_dir() else scene.parent
-    places = [scene, *(run / (FOLDER if number == 1 else f"{FOLDER}_{number}") for number in range(1, 1000))]
-    folder = next((place for place in places if _free(place)), None)
-    if folder is None:
-        raise UserError(f"{run} has too many folders of masks: delete some of {FOLDER}_….")
+    folder = masks_folder(run) if folder is None else folder.absolute()
+    if folder == run or not _free(folder):
+        raise UserError(f"{folder} holds masks that were not written here, or have been changed: name another folder.")
     again = _holds_masks(folder)
     make_masks(data, DrawnSource(members, names), config_path, folder, overwrite=again)
     write_text_atomically(_digest(folder), folder / STAMP)
     config = open_run(config_path)
-    saved = f"{'Replaced' if again else 'Saved'} {folder / 'masks'} and classes.json; look at {folder / 'made.png'}."
-    refine = command(["ns-train", "beags-refine", "--data", data.data, "--load-dir", config.get_checkpoint_dir()])
-    if folder == scene:
-        return [saved, f"Next: {refine}"]
-    kept = f"{scene} has masks already, which stay as they are."
-    return [saved, kept, f"Next: {refine} beags-data --masks-path {quoted(folder / 'masks')} --classes-path "
-            f"{quoted(folder / 'classes.json')}"]  # fmt: skip
+    said = f"{'Replaced' if again else 'Saved'} {folder / 'masks'} and classes.json; look at {folder / 'made.png'}."
+    photos = config.data_config.photos
+    own: dict[str, Any] = {"masks_path": None, "classes_path": Path("classes.json"), "ignore_ids": ()}
+    if folder != scene:
+        own |= {"masks_path": folder / "masks", "classes_path": folder / "classes.json"}
+    words = [
+        "ns-train", "beags-refine", "--data", str(data.data), "--load-dir", str(config.get_checkpoint_dir().absolute()),
+        *([] if photos == "all" else ["--pipeline.datamanager.photos", photos]),
+        *option_words(replace(data, **own)),
+    ]  # fmt: skip
+    return SavedMasks(said, command(words))
+
+
+def option_words(parser: BeagsDataParserConfig) -> list[str]:
+    """Return the options of ``beags-data`` that make a data parser, as words of a command; none for the usual ones."""
+    usual, words = BeagsDataParserConfig(), []
+    for field in fields(parser):
+        value = getattr(parser, field.name)
+        if field.name not in ("_target", "data") and value != getattr(usual, field.name):
+            parts = [str(each) for each in value] if isinstance(value, (list, tuple)) else [str(value)]
+            words += [f"--{field.name.replace('_', '-')}", *parts]
+    return ["beags-data", *words] if words else []
 
 
 def _holds_masks(folder: Path) -> bool:

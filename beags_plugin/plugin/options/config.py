@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import torch
 import yaml
@@ -24,6 +24,7 @@ from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.system.errors import UserError, print_user_errors_plainly, writing
 from beags_plugin.system.interrupts import stop
 from beags_plugin.system.lock import lock_ahead, run_lock
+from beags_plugin.system.output_option import OUTPUT_DIR
 from beags_plugin.system.pasted import quoted
 from beags_plugin.system.registry import load
 from beags_plugin.system.whole_files import write_text_atomically
@@ -67,6 +68,8 @@ class BeagsTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: load("beags_plugin.plugin.trainer:BeagsTrainer"))
     prompt: Suppress[str | None] = None  # for fields made from text
+    output_dir: Annotated[Path, OUTPUT_DIR] = Path("outputs")
+    """Folder of all runs: see run_dir."""
     run_dir: Path | None = None
     """Folder of this run; None puts it where nerfstudio does (output_dir/experiment/method/timestamp)."""
     overwrite: bool = False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -28,8 +29,30 @@ def legend(rows: Iterable[LegendRow]) -> str:
     for row in rows:
         name = escaped(shortened(row.name))
         text = {"shown": name, "hidden": f"~~{name}~~"}.get(row.state, f"~~{name}~~ {row.state}")
-        lines.append(f"| `{hex_color(row.class_id)}` | {text} | {row.count:,} |")
+        lines.append(f"| {swatch(row.class_id)} | {text} | {row.count:,} |")
     return "\n".join(lines)
+
+
+def swatch(class_id: int) -> str:
+    """Return a small square in the colour of a class."""
+    style = f'{{{{display: "block", width: "1em", height: "1em", background: "{hex_color(class_id)}"}}}}'
+    return f"<span style={style} />"
+
+
+def wrapped(text: str) -> str:
+    """Return a text of which no word, such as a path, is wider than the panel."""
+    return f'<div style={{{{overflowWrap: "anywhere"}}}}>{_literal(text)}</div>'
+
+
+def pasteable(command: str) -> str:
+    """Return a command to copy: one click chooses all of it."""
+    style = '{{whiteSpace: "pre-wrap", overflowWrap: "anywhere", userSelect: "all", fontSize: "0.8em"}}'
+    return f"<pre style={style}>{_literal(command)}</pre>"
+
+
+def _literal(text: str) -> str:
+    """Return text as a JavaScript string of MDX; no part of it is taken for Markdown, or for a picture by viser."""
+    return f"{{{json.dumps(text)}}}".replace("!", "\\u0021").replace("<", "\\u003c")
 
 
 def hex_color(class_id: int) -> str:

@@ -28,10 +28,18 @@ from beags_plugin.plugin.viewer.legend import LegendRow, capitalised, escaped, l
 from beags_plugin.plugin.viewer.pick_tab import PickTab
 from beags_plugin.plugin.viewer.pick_work import take_picked
 from beags_plugin.plugin.viewer.picking import under_cursor
-from beags_plugin.plugin.viewer.serving import end_when_interrupted, first_folder, offer_whole_pictures, set_pace
+from beags_plugin.plugin.viewer.serving import (
+    end_when_interrupted,
+    first_folder,
+    hide_training_cameras,
+    leave_out_training,
+    offer_whole_pictures,
+    set_pace,
+)
 from beags_plugin.plugin.viewer.size_tab import SizeTab
 from beags_plugin.plugin.viewer.viewed_run import ViewedRun
 from beags_plugin.plugin.viewer.viewing import NO_CLASSES, Viewing
+from beags_plugin.plugin.viewer.window import Windows
 from beags_plugin.system.errors import UserError
 
 if TYPE_CHECKING:
@@ -63,6 +71,7 @@ class ObjectPanel(ViewerElement[None]):
         self.clicks: SceneClicks | None = None
         self.pick_tab: PickTab | None = None
         self.size_tab: SizeTab | None = None
+        self._windows: Windows | None = None
         self._legend: Any = None
         self._status: Any = None
         self._counted: tuple | None = None
@@ -124,6 +133,10 @@ class ObjectPanel(ViewerElement[None]):
             if viewer.trainer is None:  # Gaussians that are trained have no fixed numbers
                 self.pick_tab = PickTab(self._server, self.viewing, self._listed, self._redraw, clicks, self._scale_by)
             self.size_tab = SizeTab(self._server, self.viewing, clicks)
+            hide_training_cameras(viewer, lambda index: self._hit_camera(run.names[index]))
+            if viewer.trainer is None:
+                self._windows = Windows(viewer)
+                leave_out_training(viewer)
         if run.note is not None:
             self.note("run", run.note)
         offer_whole_pictures(viewer.control_panel)
@@ -151,7 +164,7 @@ class ObjectPanel(ViewerElement[None]):
     def _joined(self, client: ClientHandle) -> None:
         """Pace a new page's pictures, and let it begin at the objects."""
         assert self.viewer is not None
-        set_pace(self.viewer, client.client_id, self.viewing.pace)
+        set_pace(self.viewer, client.client_id, self.viewing.pace, self._windows)
         # not here: no message of the page is read while this runs
         threading.Thread(target=self.centre, args=(client, True), daemon=True).start()
 
@@ -169,6 +182,13 @@ class ObjectPanel(ViewerElement[None]):
             return
         frame = frame_of(*self.viewing.whole(), wanted, run.cameras)
         look(client, frame, side_of_photos(frame, run.cameras) if first else None)
+
+    def _hit_camera(self, name: str) -> None:
+        """Say that a click went to a training camera, to which nerfstudio takes the page."""
+        text = f"The click hit the training camera of {name}, not the scene. Hide Train Cams, and click again."
+        self.note("object", text)
+        if self.pick_tab is not None:
+            self.pick_tab.report(text)
 
     def _redraw(self) -> None:
         if self.viewer is not None:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from beags_plugin.export import EXPORTERS
 from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.picking.cutter import ViewMarks
+from beags_plugin.plugin.objects.picked_masks import masks_folder
 from beags_plugin.plugin.viewer.clicks import SceneClicks
 from beags_plugin.plugin.viewer.export import ShownFiles
-from beags_plugin.plugin.viewer.legend import LegendRow, escaped, legend, unique_labels
+from beags_plugin.plugin.viewer.legend import LegendRow, legend, pasteable, unique_labels, wrapped
 from beags_plugin.plugin.viewer.pick_work import FIRST_COLOR, PickWork
 from beags_plugin.plugin.viewer.pointing import box_mark, click_mark, page_camera
 from beags_plugin.plugin.viewer.serving import another_tab, by_user
@@ -38,12 +40,13 @@ class PickTab:
         self.server = server
         self.viewing = viewing
         self.note = _HELP
+        self.command = ""
         self._labels = labels
         self._redraw = redraw
         self._boxing = False
         self._entries: dict[str, tuple[str, int]] = {}
         self._text = ""
-        self.work = PickWork(viewing, self.report, self.refresh)
+        self.work = PickWork(viewing, self.report, self.refresh, self.picture)
         gui = server.gui
         formats = EXPORTERS.names()
         with another_tab(gui, "Pick"):
@@ -57,12 +60,16 @@ class PickTab:
             self.undo = gui.add_button("Undo")
             self.alone = gui.add_checkbox("Only what is picked", False)
             self._status = gui.add_markdown("")
+            self._sides = gui.add_markdown("")
             self.format = gui.add_dropdown("As", formats, "ply" if "ply" in formats else formats[0])
             self.export = gui.add_button("Export the picked object")
+            self.folder = gui.add_text("Masks to", str(self._usual_folder()), hint="Folder that Save as masks writes")
             self.masks = gui.add_button("Save as masks", hint="Of all objects, for the training views")
+            self._where = gui.add_markdown("")
             self.keep = gui.add_button("Keep in the run", hint="As its objects, for every command")
         self.files = ShownFiles(viewing, self._title, lambda: self.format.value, self.report, self.work.part, scale_by)
         clicks.offer(self.clicks, self.clicked)
+        self._say_where()
         self._listen()
         self.refresh()
 
@@ -75,7 +82,8 @@ class PickTab:
         self.undo.on_click(lambda _: self.work.undo())
         self.alone.on_update(by_user(lambda: self.work.show_alone(self.alone.value)))
         self.export.on_click(lambda _: self.files.start())
-        self.masks.on_click(lambda _: self.work.save_masks())
+        self.folder.on_update(lambda _: self._say_where())
+        self.masks.on_click(lambda _: self.work.save_masks(self._folder()))
         self.keep.on_click(lambda _: self.work.keep())
 
     # -- pointing ----------------------------------------------------------------------------------------------------
@@ -139,10 +147,32 @@ class PickTab:
 
     # -- what the tab shows ------------------------------------------------------------------------------------------
 
-    def report(self, text: str) -> None:
-        """Show a sentence below the controls, in place of the last one."""
+    def report(self, text: str, command: str = "") -> None:
+        """Show a sentence below the controls, in place of the last one. command: to paste into a terminal."""
         self.note = text
+        if command:
+            self.command = command
+            self._say_where()
         self._write()
+
+    def picture(self, text: str) -> None:
+        """Show pictures of the chosen object, as Markdown."""
+        with suppress(KeyError):  # the viewer is being closed
+            self._sides.content = f"From sides that were not clicked:\n\n{text}" if text else ""
+
+    def _usual_folder(self) -> Path:
+        assert self.viewing.run is not None
+        return masks_folder(self.viewing.run.folder)
+
+    def _folder(self) -> Path:
+        typed = self.folder.value.strip()
+        return Path(typed).expanduser() if typed else self._usual_folder()
+
+    def _say_where(self) -> None:
+        with suppress(KeyError):  # the viewer is being closed
+            where = wrapped(f"Save as masks writes to {self._folder()}")
+            after = f"\n\nRefine with the saved ones:\n\n{pasteable(self.command)}" if self.command else ""
+            self._where.content = where + after
 
     def refresh(self) -> None:
         """Show what has been picked."""
@@ -174,7 +204,7 @@ class PickTab:
             for place, one in enumerate(self.work.picks.objects)
             if one.members is not None
         ]
-        text = "\n\n".join([*([legend(rows)] if rows else []), escaped(self.note)])
+        text = "\n\n".join([*([legend(rows)] if rows else []), wrapped(self.note)])
         if text != self._text:
             with suppress(KeyError):
                 self._status.content = text

@@ -22,8 +22,10 @@ from beags_plugin.plugin.runs.picked import with_picked, write_picked
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.viewer.choice import Visible
 from beags_plugin.plugin.viewer.legend import capitalised
+from beags_plugin.plugin.viewer.other_sides import sides_picture
 from beags_plugin.plugin.viewer.viewing import Paint, Viewing
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import say
 
 _CHOSEN, _OTHERS = 0.65, 0.4  # of the colour, over what has been picked
 FIRST_COLOR = 3  # of ``colorize``: one that few things have
@@ -48,17 +50,23 @@ class PickWork:
     """What has been picked of a scene that is trained no longer; each method returns at once.
 
     One thread does the steps in their order, so that neither pictures nor the page wait for a cut. A step that fails
-    changes nothing. report: receives sentences. changed: is called after every step.
+    changes nothing. report: receives a sentence, and a command that goes on if there is one. changed: is called after
+    every step. pictured: receives Markdown of the chosen object from other sides, "" where there is none.
     """
 
-    def __init__(self, viewing: Viewing, report: Callable[[str], None], changed: Callable[[], None]) -> None:
+    def __init__(
+        self, viewing: Viewing, report: Callable[..., None], changed: Callable[[], None],
+        pictured: Callable[[str], None] = lambda _: None,
+    ) -> None:  # fmt: skip
         self.picks = Picks()
         self.alone = False
         self._viewing = viewing
         self._report = report
         self._changed = changed
+        self._pictured = pictured
         self._history: list[Picks] = []
         self._made: Cutter | None = None
+        self._shown: Tensor | None = None  # the members whose other sides are shown
         self._steps: queue.SimpleQueue[Callable[[], str]] = queue.SimpleQueue()
         threading.Thread(target=self._work, name="beags pick", daemon=True).start()
 
@@ -106,7 +114,7 @@ class PickWork:
 
         self._steps.put(do)
 
-    def save_masks(self) -> None:
+    def save_masks(self, folder: Path | None = None) -> None:
         """Draw all objects into masks of the training views; see ``picked_masks.save_masks``."""
 
         def do() -> str:
@@ -114,7 +122,10 @@ class PickWork:
             if self.picks.changed() or not any(members.present()):  # there may be objects of the run alone
                 members, names = self.picks.applied(members, names)
             self._report("Drawing masks of all training views ...")
-            return " ".join(save_masks(self._run() / "config.yml", members, names))
+            saved = save_masks(self._run() / "config.yml", members, names, folder)
+            say(f"{saved.said} To refine with them:\n{saved.command}")
+            self._report(saved.said, saved.command)
+            return ""
 
         self._steps.put(do)
 
@@ -187,6 +198,22 @@ class PickWork:
             if message:
                 self._report(message)
             self._changed()
+            if self._steps.empty():
+                self._picture()
+
+    def _picture(self) -> None:
+        """Show the chosen object from sides that nobody has clicked on, unless they are shown already."""
+        one, paint = self.picks.chosen, self._viewing.paint
+        if one.members is self._shown:
+            return
+        self._shown, text = one.members, None
+        if one.members is not None and paint is not None:
+            clicked = [view.camera.center for view in one.marks]
+            try:
+                text = sides_picture(self._viewing, one.members, clicked, replace(paint, only=None))
+            except Exception as error:  # nobody else sees an exception of a thread
+                self._report(f"No pictures of other sides ({type(error).__name__}: {error}).")
+        self._pictured(text or "")
 
     def _cutter(self) -> Cutter:
         viewing = self._viewing

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
     from viser import GuiApi, GuiTabHandle, ViserServer
 
+    from beags_plugin.plugin.viewer.window import Windows
+
 
 @contextmanager
 def first_folder(gui: GuiApi, label: str) -> Iterator[Any]:
@@ -52,12 +54,46 @@ def by_user(listener: Callable[[], None]) -> Callable[[Any], None]:
     return heard
 
 
-def set_pace(viewer: Viewer, client_id: int, pace: Pace) -> None:
-    """Let ``pace`` choose the size of a page's pictures while its camera moves."""
+def set_pace(viewer: Viewer, client_id: int, pace: Pace, windows: Windows | None) -> None:
+    """Let ``pace`` choose the size of a page's pictures while its camera moves, and ``windows`` that at rest.
+
+    windows: None leaves the size at rest to nerfstudio.
+    """
     machine, controls = viewer.render_statemachines[client_id], viewer.control_panel
     still = machine._calculate_image_res
-    machine._calculate_image_res = lambda aspect_ratio: (
-        still(aspect_ratio) if machine.state == "high" else pace.size(aspect_ratio, controls.max_res)
+
+    def size(aspect_ratio: float) -> tuple[int, int]:
+        if machine.state != "high":
+            return pace.size(aspect_ratio, controls.max_res)
+        return still(aspect_ratio) if windows is None else windows.size(client_id, aspect_ratio)
+
+    machine._calculate_image_res = size  # type: ignore[method-assign]
+
+
+def hide_training_cameras(viewer: Viewer, hit: Callable[[int], None]) -> None:
+    """Let the training cameras be hidden at first: they stand before the objects, and take clicks meant for these.
+
+    hit: is called with the number of a training view when its camera has taken a click.
+    """
+    draw = viewer.init_scene
+
+    def draw_hidden(*arguments: Any, **options: Any) -> None:
+        draw(*arguments, **options)
+        viewer.set_camera_visibility(False)
+        viewer.toggle_cameravis_button()
+        for index, handle in viewer.camera_handles.items():
+            handle.on_click(lambda _, index=index: hit(index))
+
+    viewer.init_scene = draw_hidden  # type: ignore[method-assign]
+
+
+def leave_out_training(viewer: Viewer) -> None:
+    """Leave out what nerfstudio shows of a training, where there is none, and a logo that it loads from the web."""
+    viewer.pause_train.visible = viewer.resume_train.visible = False
+    for control in (viewer.control_panel._train_speed, viewer.control_panel._train_util):
+        control.set_hidden(True)
+    viewer.viser_server.gui.configure_theme(
+        titlebar_content=None, control_layout="collapsible", dark_mode=True, brand_color=(255, 211, 105)
     )
 
 

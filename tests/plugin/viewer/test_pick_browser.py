@@ -32,7 +32,6 @@ def served(tmp_path_factory):
     config, owner = write_solids_run(root / "run", write_solids(root / "lab"))
     with viewed(config, root / "log.txt") as address, Page(address, WIDTH, HEIGHT) as page:
         page.open_tab("Pick")
-        page.press("Hide Train Cams")  # a click on one would go there
         whole = awaited(page, lambda now: varied(now) > 2)
         page.drag((160, 300), (170, 300))  # the first picture may be that of a page of another size
         awaited(page, lambda now: varied(now) > 2 and differing(now, whole) > 0.002)
@@ -162,9 +161,11 @@ def test_objects_are_picked_saved_refined_and_kept(served):
     page.press("Save as masks")
     page.wait_for_text("Saved ", 300)
     page.wait_for_text("ns-train beags-refine")
-    names = json.loads((lab / "classes.json").read_text())
+    assert not (lab / "masks").exists()
+    saved = run / "picked"
+    names = json.loads((saved / "classes.json").read_text())
     assert sorted(names.values()) == ["background", "high", "low"]
-    masks = sorted((lab / "masks").glob("*.png"))
+    masks = sorted((saved / "masks").glob("*.png"))
     assert masks and set(np.concatenate([np.unique(read_id_mask(path)) for path in masks])) == {0, 1, 2}
 
     page.press("Keep in the run")
@@ -177,6 +178,7 @@ def test_objects_are_picked_saved_refined_and_kept(served):
     refine = preset_config("beags-refine", {"vis": "tensorboard", "pipeline.model.refine_steps": 5}, run.parent / "new")
     refine.data_config.data, refine.load_dir = lab, run / "nerfstudio_models"
     parser = refine.data_config.dataparser
+    parser.masks_path, parser.classes_path = saved / "masks", saved / "classes.json"
     parser.orientation_method, parser.center_method = "none", "none"  # as in the run
     parser.auto_scale_poses, parser.scale_factor = False, 1.0
     refine.machine.device_type = "cpu"
@@ -187,3 +189,28 @@ def test_objects_are_picked_saved_refined_and_kept(served):
     trainer.train()
     (extracted,) = extract_objects(run.parent / "new/config.yml", ["low"], keep_all=True)
     assert extracted.gaussians > 0.8 * low
+
+
+def test_the_first_moment_shows_the_scene_and_a_click_on_a_camera_is_told(served):
+    """The page begins where the first training camera stands, whose photo would cover the scene and take all clicks."""
+    _, _, page = served
+    page.open_tab("Pick")
+    text = page.text()
+    assert "Show Train Cams" in text and "Hide Train Cams" not in text
+    for word in ("Training", "Train Util", "Train Speed", "NerfStudio", "Canvas of this page"):
+        assert word not in text.replace("Train Cams", "")
+    assert page.evaluate("document.querySelectorAll('img[src^=http]').length") == 0
+    page.press("Show Train Cams")
+    page.wait_for_text("Hide Train Cams")
+    page.wait(lambda: page.click(160, 200) or "The click hit the training camera of v" in page.text())
+    page.press("Hide Train Cams")
+    page.wait_for_text("Show Train Cams")
+
+
+def test_no_text_is_wider_than_the_panel(served):
+    _, _, page = served
+    wide = (
+        "[...document.querySelectorAll('pre, p, div')].filter(e => e.innerText?.includes('beags-refine')"
+        " && e.scrollWidth > e.clientWidth + 1 && e.clientWidth > 0).length"
+    )
+    assert "beags-refine" in page.text() and page.evaluate(wide) == 0

@@ -2,29 +2,43 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import re
+import shlex
 import time
 from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+import tyro
+from PIL import Image
 from solid_runs import COLOURED, POINTS, write_solids, write_solids_run
 from touching_solids import SETTINGS, solids, views
 
 pytest.importorskip("nerfstudio")
 
 from clicked_pages import VIEW, click_on, page, position
+from run_folders import ring_cameras
 from viewer_windows import Window
 
 from beags_plugin.extraction.ply import read_ply, write_ply
 from beags_plugin.labels.classes import read_id_mask
+from beags_plugin.labels.colors import colorize
 from beags_plugin.plugin.objects.export import export_run
 from beags_plugin.plugin.objects.extract import extract_objects
+from beags_plugin.plugin.objects.picked_masks import option_words
 from beags_plugin.plugin.runs.picked import PICKED_FILE
 from beags_plugin.plugin.runs.read import read_run, read_transform
+from beags_plugin.plugin.viewer.legend import pasteable
+from beags_plugin.plugin.viewer.other_sides import other_sides
+from beags_plugin.plugin.viewer.pick_work import FIRST_COLOR
 from beags_plugin.plugin.viewer.pointing import page_camera
+from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system.errors import UserError
@@ -172,20 +186,27 @@ def test_the_box_around_the_scene_is_seen_from_inside_and_taken_away(opened):
         assert np.cross(b - a, c - a) @ a < 0
 
 
-def test_masks_are_saved_for_training_views_and_never_over_others(opened):
+def test_masks_are_saved_for_training_views_and_never_over_others(opened, capsys):
     tab, config = opened()
-    lab = config.parent.parent / "lab"
+    lab, picked = config.parent.parent / "lab", config.parent / "picked"
+    assert f"writes to {picked}" in tab._where.content and tab.folder.value == str(picked)
     assert "nothing has been picked" in press(tab, tab.work.save_masks, "Nothing has been changed").lower()
     click(tab, POINTS["low"], "Gaussians")
     tab.work.change(lambda picks: picks.named("low").another())
     click(tab, POINTS["high"], "Gaussians")
     tab.work.change(lambda picks: picks.named("low"))
     assert "two objects called 'low'" in press(tab, tab.work.save_masks, "Nothing has been changed")
-    assert not (lab / "masks").exists()
+    assert not picked.exists()
     tab.work.change(lambda picks: picks.named("high"))
-    assert "beags-refine" in press(tab, tab.work.save_masks, "Saved")
-    assert json.loads((lab / "classes.json").read_text()) == {"0": "background", "1": "low", "2": "high"}
-    files = sorted((lab / "masks").glob("*.png"))
+    assert str(picked / "masks") in press(tab, tab.work.save_masks, "Saved")
+    assert not (lab / "masks").exists(), "the photos' folder may be somebody else's"
+    assert tab.command in capsys.readouterr().out.splitlines() and pasteable(tab.command) in tab._where.content
+    refine, at = parsed_command(tab.command)
+    assert refine["data"] == lab and refine["load_dir"] == config.parent / "nerfstudio_models"
+    assert (at.masks_path, at.classes_path) == (picked / "masks", picked / "classes.json")
+    assert at.auto_scale_poses is False and at.orientation_method == "none"  # as in the run
+    assert json.loads((picked / "classes.json").read_text()) == {"0": "background", "1": "low", "2": "high"}
+    files = sorted((picked / "masks").glob("*.png"))
     cameras = {f"v{index}": camera for index, camera in enumerate(views()[3:] + views()[:3])}
     assert 0 < len(files) < len(cameras), "held-out views have none"
     inputs = geometry_inputs(solids(COLOURED)[0], OWNER.int())
@@ -199,12 +220,69 @@ def test_masks_are_saved_for_training_views_and_never_over_others(opened):
                     (found == number) | (exact == number)
                 ).sum()
     click(tab, (0.3, 0.2, 0.5), "Gaussians")
-    assert "Replaced" in press(tab, tab.work.save_masks, "beags-refine")
+    assert str(picked / "masks") in press(tab, tab.work.save_masks, "Replaced")
     files[0].write_bytes(files[1].read_bytes())  # mended by hand
     mended = files[0].read_bytes()
-    said = press(tab, tab.work.save_masks, "--masks-path")
-    assert "has masks already" in said and files[0].read_bytes() == mended
-    assert len(list((config.parent / "picked/masks").glob("*.png"))) == len(files)
+    press(tab, lambda: tab.work.save_masks(picked), "name another folder")
+    assert str(config.parent / "picked_2/masks") in press(tab, tab.work.save_masks, "Saved")
+    assert files[0].read_bytes() == mended
+    assert len(list((config.parent / "picked_2/masks").glob("*.png"))) == len(files)
+    press(tab, lambda: tab.work.save_masks(lab), "Saved")  # asked for
+    assert len(list((lab / "masks").glob("*.png"))) == len(files) and "--masks-path" not in tab.command
+
+
+def parsed_command(command: str):
+    """Return --data and --load-dir of a command of ns-train, and the options of beags-data, as ns-train parses them."""
+    program, preset, *words = shlex.split(command)
+    assert (program, preset) == ("ns-train", "beags-refine")
+    options, own = words[: words.index("beags-data")], words[words.index("beags-data") + 1 :]
+    flags = dict(zip(options[::2], options[1::2], strict=True))
+    kind = tyro.conf.FlagConversionOff[BeagsDataParserConfig]
+    return {flag[2:].replace("-", "_"): Path(value) for flag, value in flags.items()}, tyro.cli(kind, args=own)
+
+
+def test_the_command_has_the_runs_options_of_its_data():
+    parser = BeagsDataParserConfig(
+        data=Path("/x y"), downscale_factor=2.0, ignore_ids=(3, 255), images_path=Path("a 'b'"), strict=True
+    )
+    head, *words = option_words(parser)
+    assert head == "beags-data" and option_words(BeagsDataParserConfig(data=Path("z"))) == []
+    found = tyro.cli(tyro.conf.FlagConversionOff[BeagsDataParserConfig], args=words)
+    assert replace(found, data=parser.data) == parser
+
+
+def test_the_other_sides_of_a_cut_are_shown_before_it_is_saved(opened):
+    """From the sides from which nobody has clicked, the cut is in its colour."""
+    tab, _ = opened()
+    assert tab._sides.content == ""
+    click(tab, POINTS["low"], "Gaussians")
+    end = time.monotonic() + 60
+    while not tab._sides.content:
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    coded = re.search(r"base64,([^\"]+)", tab._sides.content)
+    picture = np.asarray(Image.open(BytesIO(base64.b64decode(coded[1])))).astype(int)
+    assert picture.shape == (304, 304, 3)
+    red, green, blue = colorize(np.array([[FIRST_COLOR]]))[0, 0].astype(int) - 128
+    tinted = ((picture - 128) * [red, green, blue]).sum(axis=2)
+    for top in (0, 154):
+        for left in (0, 154):
+            assert (tinted[top : top + 150, left : left + 150] > 0.3 * (red**2 + green**2 + blue**2)).mean() > 0.02
+    press(tab, tab.work.undo, "nothing yet")
+    end = time.monotonic() + 60
+    while tab._sides.content:
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_sides_are_far_from_the_clicks_and_from_one_another():
+    cameras = ring_cameras(12, 1)
+    towards = torch.stack([camera.center / camera.center.norm() for camera in cameras])
+    found = other_sides(cameras, torch.zeros(3, dtype=torch.float64), [cameras[0].center])
+    assert len(found) == 4 and found[0] == int((towards @ towards[0]).argmin())
+    shown = towards[[0, *found]]
+    assert float((shown @ shown.T - 2 * torch.eye(5)).max()) < 0.7
+    assert other_sides(cameras, 100.0 * torch.ones(3, dtype=torch.float64), []) == []
 
 
 def test_what_is_kept_is_the_runs_for_every_command(opened):
@@ -288,8 +366,8 @@ def test_an_extracted_run_is_corrected_and_drawn_and_the_run_that_it_is_from_sta
     assert torch.equal(read_run(config).members.class_ids, before.class_ids)
     (again,) = extract_objects(extracted.config, ["low"], output=tmp_path / "out", keep_all=True)
     assert again.gaussians == int(block.sum())
-    assert "beags-refine" in press(tab, tab.work.save_masks, "Saved")
-    assert any((read_id_mask(file) == 1).any() for file in (tmp_path / "lab/masks").glob("*.png"))
+    press(tab, tab.work.save_masks, "Saved")
+    assert any((read_id_mask(file) == 1).any() for file in (extracted.config.parent / "picked/masks").glob("*.png"))
 
 
 def test_objects_of_another_programs_scene_are_picked(opened, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import fields
 
@@ -19,7 +20,16 @@ from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.violation import violation_shares
 from beags_plugin.plugin.viewer.aim import frame_of, place, side_of_photos
 from beags_plugin.plugin.viewer.choice import Choice, shown
-from beags_plugin.plugin.viewer.legend import LegendRow, escaped, hex_color, legend, unique_labels
+from beags_plugin.plugin.viewer.legend import (
+    LegendRow,
+    escaped,
+    hex_color,
+    legend,
+    pasteable,
+    swatch,
+    unique_labels,
+    wrapped,
+)
 from beags_plugin.plugin.viewer.pace import SECONDS, Pace
 from beags_plugin.plugin.viewer.picking import camera_along, pick
 from beags_plugin.plugin.viewer.pictures import (
@@ -275,7 +285,8 @@ def test_the_legend_names_colours_counts_and_states():
     lines = legend(rows).splitlines()
     assert len(lines) == 5
     red, green, blue = colorize(np.array([[1]]))[0, 0]
-    assert hex_color(1) == f"#{red:02x}{green:02x}{blue:02x}" and f"`{hex_color(1)}`" in lines[2]
+    assert hex_color(1) == f"#{red:02x}{green:02x}{blue:02x}" and f'background: "{hex_color(1)}"' in lines[2]
+    assert "`" not in lines[2]  # the page would write the colour's code beside its square
     assert "| red cup |" in lines[2] and "1,234" in lines[2]
     assert "| ~~box~~ |" in lines[3] and "| ~~lid~~ removed |" in lines[4]
 
@@ -285,9 +296,18 @@ def test_no_name_can_be_taken_for_a_program():
     text = legend([LegendRow(1, name, 1)])
     assert len(text.splitlines()) == 3  # a line end would break the table
     row = text.splitlines()[2]
-    assert row.count("|") == 4 and not set("{}<>[]*_\\") & set(row)
+    assert row.count("|") == 4 and not set("{}<>[]*_\\") & set(row.replace(swatch(1), ""))
     assert "äö 猫" in row and "&#123;alert&#40;1&#41;&#125;" in row
     assert escaped("a.b") == "a.b"
+
+
+@pytest.mark.parametrize("show", [wrapped, pasteable])
+def test_a_text_is_shown_as_it_is_and_its_longest_word_breaks(show):
+    text = "ns-train --data '/a b/{x}<b>\"![y](z)' `q`"
+    page = show(text)
+    assert "overflowWrap" in page and "![" not in page and page.count("<") == 2
+    inner = page.partition(">{")[2].rpartition("}</")[0]
+    assert json.loads(inner) == text  # a string of JavaScript
 
 
 def test_labels_are_unique_never_empty_and_in_the_order_of_ids():

@@ -1,0 +1,114 @@
+"""Small pictures of what has been picked, from sides from which nobody has clicked on it."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.plugin.viewer.choice import Visible
+from beags_plugin.plugin.viewer.viewing import Paint, Viewing, plain_outputs
+
+SIDES = 4
+_PIXELS = 150  # of each side of a picture
+_MARGIN = 1.6  # around the object, for what the cut has missed
+_GAP = 4  # pixels between two pictures
+
+
+def other_sides(cameras: Sequence[Camera], center: Tensor, clicked: Sequence[Tensor], count: int = SIDES) -> list[int]:
+    """Return which cameras see a place from sides far from ``clicked`` and from one another, at most ``count``.
+
+    center: [3], of the object. clicked: centres [3] of the cameras of all clicks.
+    """
+    center = center.double()
+    seeing = [index for index, camera in enumerate(cameras) if _sees(camera, center)]
+    towards = {index: _direction(cameras[index].center, center) for index in seeing}
+    near = [_direction(each, center) for each in clicked]
+    found: list[int] = []
+    while len(found) < count and (left := [index for index in seeing if index not in found]):
+        best = min(left, key=lambda index: max((float(towards[index] @ each) for each in near), default=0.0))
+        found.append(best)
+        near.append(towards[best])
+    return found
+
+
+def _direction(place: Tensor, center: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(place.double().cpu() - center, dim=0)
+
+
+def _sees(camera: Camera, center: Tensor) -> bool:
+    local = camera.rotation.double().cpu() @ center + camera.translation.double().cpu()
+    pixel = camera.K.double().cpu() @ local
+    column, row = (pixel[:2] / pixel[2]).tolist()
+    return float(local[2]) > 0 and 0 <= column < camera.width and 0 <= row < camera.height
+
+
+def close_camera(camera: Camera, points: Tensor, pixels: int = _PIXELS) -> Camera | None:
+    """Return a camera of the same place whose square picture shows ``points`` [P, 3]; None where it sees none."""
+    local = points.double().cpu() @ camera.rotation.double().cpu().T + camera.translation.double().cpu()
+    local = local[local[:, 2] > 0]
+    if len(local) == 0:
+        return None
+    plane = local[:, :2] / local[:, 2:]
+    low, high = plane.quantile(0.01, dim=0), plane.quantile(0.99, dim=0)
+    half = max(_MARGIN * float((high - low).max()) / 2, 4.0 / float(camera.K[0, 0]))
+    focal, middle = pixels / (2 * half), (low + high) / 2
+    K = torch.tensor(
+        [
+            [focal, 0.0, pixels / 2 - focal * float(middle[0])],
+            [0.0, focal, pixels / 2 - focal * float(middle[1])],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    return Camera(camera.viewmat.cpu(), K, pixels, pixels)
+
+
+@torch.no_grad()
+def sides_picture(viewing: Viewing, members: Tensor, clicked: Sequence[Tensor], paint: Paint) -> str | None:
+    """Return Markdown of a picture of the chosen object from ``SIDES`` other sides; None where no camera sees it.
+
+    members: [N] bool. clicked: see ``other_sides``. paint: of the picks.
+    """
+    run, model = viewing.run, viewing.model
+    surfels = model.surfels().detach()
+    points = surfels.means[members.to(surfels.means.device)].cpu()
+    if run is None or len(points) == 0:
+        return None
+    if len(points) > 20_000:  # quantile takes no more than 16 million values
+        points = points[:: math.ceil(len(points) / 20_000)]
+    views = other_sides(run.cameras, points.double().median(dim=0).values, clicked)
+    shown: list[np.ndarray] = []
+    for index in views:
+        camera = close_camera(run.cameras[index], points)
+        if camera is not None:
+            scene = Visible(surfels, model.class_ids, None)
+            outputs = plain_outputs(model, scene, camera.to(model.device), model.background_color, paint)
+            shown.append((255 * outputs["rgb"]).round().to(torch.uint8).cpu().numpy())
+    if not shown:
+        return None
+    names = ", ".join(run.names[index] for index in views)
+    return picture_text(_grid(shown), names)
+
+
+def _grid(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    """Return pictures [H, W, 3] in rows of two."""
+    rows = -(-len(pictures) // 2)
+    sheet = np.full((rows * (_PIXELS + _GAP) - _GAP, 2 * _PIXELS + _GAP, 3), 30, np.uint8)
+    for place, picture in enumerate(pictures):
+        top, left = (place // 2) * (_PIXELS + _GAP), (place % 2) * (_PIXELS + _GAP)
+        sheet[top : top + _PIXELS, left : left + _PIXELS] = picture
+    return sheet
+
+
+def picture_text(picture: np.ndarray, title: str) -> str:
+    """Return a picture [H, W, 3] uint8 as Markdown that is as wide as the panel. title: shows under the mouse."""
+    _, content = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    url = f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode()}"
+    words = "".join(letter if letter.isalnum() or letter in " .,_-" else "?" for letter in title)
+    return f'<img src="{url}" title="{words}" alt="{words}" style={{{{width: "100%"}}}} />'

@@ -1,0 +1,8 @@
+"""The option that says where results go: every command takes both of its names."""
+
+from __future__ import annotations
+
+import tyro
+
+OUTPUT = tyro.conf.arg(aliases=("--output-dir",))
+OUTPUT_DIR = tyro.conf.arg(aliases=("--output",))

@@ -1,0 +1,47 @@
+"""Options of the commands: results go to --output or --output-dir, in each; help has no box of an unnamed kind."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import re
+import typing
+
+import pytest
+import tyro
+
+from beags_plugin.bench.commands import SHIPPED
+from beags_plugin.commands import cli, masks
+
+WORDS = [
+    *([command.__name__.lower()] for command in typing.get_args(cli.Command) if command.__name__ not in "MasksBench"),
+    *(["masks", action.__name__.lower()] for action in (masks.Check, masks.Make, masks.Reproject, masks.Truth)),
+    *(["bench", name] for name in (next(iter(SHIPPED)), "file", "paper", "captures")),
+]
+
+
+def help_of(words: list[str]) -> str:
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), pytest.raises(SystemExit):
+        cli.main([*words, "--help"])
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("words", WORDS, ids=" ".join)
+def test_both_names_of_the_output_are_taken_where_one_is(words):
+    text = help_of(words)
+    assert ("--output " in text) == ("--output-dir " in text), text
+    assert "options options" not in text
+
+
+def test_ns_train_takes_both_names():
+    pytest.importorskip("nerfstudio")
+    from beags_plugin.plugin.options.config import BeagsTrainerConfig
+    from beags_plugin.plugin.presets import load_preset
+
+    kind = tyro.conf.FlagConversionOff[BeagsTrainerConfig]
+    for flag in ("--output", "--output-dir"):
+        found = tyro.cli(kind, args=[flag, "there"], default=load_preset("beags").config)
+        assert str(found.output_dir) == "there"
+        assert re.search(r"run_dir|outputs", str(dataclasses.fields(found)))
