@@ -75,11 +75,15 @@ def save_masks(
 
 
 def option_words(parser: BeagsDataParserConfig) -> list[str]:
-    """Return the options of ``beags-data`` that make a data parser, as words of a command; none for the usual ones."""
+    """Return the options of ``beags-data`` that make a data parser, as words of a command; none for the usual ones.
+
+    Those that the command line does not offer are left out.
+    """
     usual, words = BeagsDataParserConfig(), []
     for field in fields(parser):
         value = getattr(parser, field.name)
-        if field.name not in ("_target", "data") and value != getattr(usual, field.name):
+        hidden = str(field.type).startswith("Suppress") or field.name in ("_target", "data")
+        if not hidden and value != getattr(usual, field.name):
             parts = [str(each) for each in value] if isinstance(value, (list, tuple)) else [str(value)]
             words += [f"--{field.name.replace('_', '-')}", *parts]
     return ["beags-data", *words] if words else []

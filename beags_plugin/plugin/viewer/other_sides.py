@@ -19,6 +19,8 @@ SIDES = 4
 _PIXELS = 150  # of each side of a picture
 _MARGIN = 1.6  # around the object, for what the cut has missed
 _GAP = 4  # pixels between two pictures
+_TRIED = 10  # views, of which some see the object behind other things
+_WHITE, _LEAST_SHOWN = 0.9, 0.03  # light of the object painted white, and the share of the picture that it must have
 
 
 def other_sides(cameras: Sequence[Camera], center: Tensor, clicked: Sequence[Tensor], count: int = SIDES) -> list[int]:
@@ -82,18 +84,19 @@ def sides_picture(viewing: Viewing, members: Tensor, clicked: Sequence[Tensor], 
         return None
     if len(points) > 20_000:  # quantile takes no more than 16 million values
         points = points[:: math.ceil(len(points) / 20_000)]
-    views = other_sides(run.cameras, points.double().median(dim=0).values, clicked)
-    shown: list[np.ndarray] = []
-    for index in views:
+    scene = Visible(surfels, model.class_ids, None)
+    alone = Paint(torch.ones_like(paint.colors), members.float().to(model.device))
+    shown: dict[str, np.ndarray] = {}
+    for index in other_sides(run.cameras, points.double().median(dim=0).values, clicked, _TRIED):
         camera = close_camera(run.cameras[index], points)
-        if camera is not None:
-            scene = Visible(surfels, model.class_ids, None)
-            outputs = plain_outputs(model, scene, camera.to(model.device), model.background_color, paint)
-            shown.append((255 * outputs["rgb"]).round().to(torch.uint8).cpu().numpy())
-    if not shown:
-        return None
-    names = ", ".join(run.names[index] for index in views)
-    return picture_text(_grid(shown), names)
+        if camera is None or len(shown) == SIDES:
+            continue
+        camera = camera.to(model.device)
+        black = model.background_color.new_zeros(3)
+        bright, painted = (plain_outputs(model, scene, camera, black, each)["rgb"] for each in (alone, paint))
+        if float((bright.amin(dim=2) > _WHITE).float().mean()) > _LEAST_SHOWN:
+            shown[run.names[index]] = (255 * painted).round().to(torch.uint8).cpu().numpy()
+    return picture_text(_grid(list(shown.values())), ", ".join(shown)) if shown else None
 
 
 def _grid(pictures: Sequence[np.ndarray]) -> np.ndarray:

@@ -32,14 +32,13 @@ from beags_plugin.plugin.viewer.serving import (
     end_when_interrupted,
     first_folder,
     hide_training_cameras,
-    leave_out_training,
     offer_whole_pictures,
     set_pace,
 )
 from beags_plugin.plugin.viewer.size_tab import SizeTab
 from beags_plugin.plugin.viewer.viewed_run import ViewedRun
 from beags_plugin.plugin.viewer.viewing import NO_CLASSES, Viewing
-from beags_plugin.plugin.viewer.window import Windows
+from beags_plugin.plugin.viewer.window import Windows, shown_finished
 from beags_plugin.system.errors import UserError
 
 if TYPE_CHECKING:
@@ -135,8 +134,7 @@ class ObjectPanel(ViewerElement[None]):
             self.size_tab = SizeTab(self._server, self.viewing, clicks)
             hide_training_cameras(viewer, lambda index: self._hit_camera(run.names[index]))
             if viewer.trainer is None:
-                self._windows = Windows(viewer)
-                leave_out_training(viewer)
+                self._windows = shown_finished(viewer)
         if run.note is not None:
             self.note("run", run.note)
         offer_whole_pictures(viewer.control_panel)

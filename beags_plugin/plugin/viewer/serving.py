@@ -87,16 +87,6 @@ def hide_training_cameras(viewer: Viewer, hit: Callable[[int], None]) -> None:
     viewer.init_scene = draw_hidden  # type: ignore[method-assign]
 
 
-def leave_out_training(viewer: Viewer) -> None:
-    """Leave out what nerfstudio shows of a training, where there is none, and a logo that it loads from the web."""
-    viewer.pause_train.visible = viewer.resume_train.visible = False
-    for control in (viewer.control_panel._train_speed, viewer.control_panel._train_util):
-        control.set_hidden(True)
-    viewer.viser_server.gui.configure_theme(
-        titlebar_content=None, control_layout="collapsible", dark_mode=True, brand_color=(255, 211, 105)
-    )
-
-
 def offer_whole_pictures(controls: Any) -> None:
     """Leave nerfstudio's "gl_z_buf_depth" out of the lists of outputs.
 

@@ -1,4 +1,7 @@
-"""The size of a page's picture at rest: that of the canvas it fills, which viser's camera messages do not tell."""
+"""A page of a finished run: nothing of a training, and a picture at rest that is as large as the canvas it fills.
+
+viser's camera messages do not tell the size of the canvas, so a script of the page does.
+"""
 
 from __future__ import annotations
 
@@ -69,3 +72,14 @@ class Windows:
         longest = min(longest, self._viewer.control_panel.max_res)
         height = round(longest / max(1.0, aspect))
         return max(height, 1), max(round(height * aspect), 1)
+
+
+def shown_finished(viewer: Viewer) -> Windows:
+    """Leave out what nerfstudio shows of a training, and a logo that it loads from the web; return the pages' sizes."""
+    viewer.pause_train.visible = viewer.resume_train.visible = False
+    for control in (viewer.control_panel._train_speed, viewer.control_panel._train_util):
+        control.set_hidden(True)
+    viewer.viser_server.gui.configure_theme(
+        titlebar_content=None, control_layout="collapsible", dark_mode=True, brand_color=(255, 211, 105)
+    )
+    return Windows(viewer)

@@ -204,7 +204,7 @@ def test_masks_are_saved_for_training_views_and_never_over_others(opened, capsys
     refine, at = parsed_command(tab.command)
     assert refine["data"] == lab and refine["load_dir"] == config.parent / "nerfstudio_models"
     assert (at.masks_path, at.classes_path) == (picked / "masks", picked / "classes.json")
-    assert at.auto_scale_poses is False and at.orientation_method == "none"  # as in the run
+    assert at.orientation_method == "none"  # as in the run
     assert json.loads((picked / "classes.json").read_text()) == {"0": "background", "1": "low", "2": "high"}
     files = sorted((picked / "masks").glob("*.png"))
     cameras = {f"v{index}": camera for index, camera in enumerate(views()[3:] + views()[:3])}
@@ -249,6 +249,7 @@ def test_the_command_has_the_runs_options_of_its_data():
     assert head == "beags-data" and option_words(BeagsDataParserConfig(data=Path("z"))) == []
     found = tyro.cli(tyro.conf.FlagConversionOff[BeagsDataParserConfig], args=words)
     assert replace(found, data=parser.data) == parser
+    assert option_words(replace(parser, auto_scale_poses=False)) == option_words(parser), "ns-train has no such option"
 
 
 def test_the_other_sides_of_a_cut_are_shown_before_it_is_saved(opened):
@@ -281,7 +282,7 @@ def test_sides_are_far_from_the_clicks_and_from_one_another():
     found = other_sides(cameras, torch.zeros(3, dtype=torch.float64), [cameras[0].center])
     assert len(found) == 4 and found[0] == int((towards @ towards[0]).argmin())
     shown = towards[[0, *found]]
-    assert float((shown @ shown.T - 2 * torch.eye(5)).max()) < 0.7
+    assert float((shown @ shown.T - 2 * torch.eye(5)).max()) < 0.9  # no two of them are neighbours
     assert other_sides(cameras, 100.0 * torch.ones(3, dtype=torch.float64), []) == []
 
 
