@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shlex
+import shutil
 from contextlib import suppress
 from pathlib import Path
 
@@ -27,6 +29,14 @@ def exchanged(ids: np.ndarray, *order: int) -> np.ndarray:
 
 def test_good_masks_give_no_finding(tmp_path):
     assert issues(write_balls(tmp_path)) == {}
+
+
+def test_a_scene_without_masks_is_told_the_whole_command_that_makes_them(tmp_path):
+    root = write_balls(tmp_path / "my scene")
+    shutil.rmtree(root / "masks")
+    (missing,) = issues(root)["missing"]
+    words = shlex.split(missing.message.partition("make them with: ")[2])
+    assert words == ["beags", "masks", "make", "--data", str(root), "--source", "salient"]
 
 
 def test_exchanged_ids_are_found_with_the_view(tmp_path):

@@ -16,6 +16,7 @@ from beags_plugin.labels.classes import palette_of, read_mask
 from beags_plugin.labels.id_checks import check_ids, check_palettes
 from beags_plugin.masks.check.issues import STOPS, Issue, named, percent
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.pasted import quoted
 
 FEW_VIEWS = 3  # an object needs two other views to outvote one
 MOST_IDS = 256  # in one file, or compared between views, with memory of their square
@@ -166,6 +167,12 @@ def _no_id_image(files: MaskFiles, view: int, ids: int) -> Issue:
     )
 
 
+def _make(files: MaskFiles) -> str:
+    """Return the command that makes masks of what stands out in a scene's photos."""
+    scene = quoted(files.folder.parent) if files.folder.name == "masks" else "SCENE"
+    return f"beags masks make --data {scene} --source salient"
+
+
 def _missing(files: MaskFiles) -> Iterator[Issue]:
     trained = [view for view, used in enumerate(files.trained) if used]
     without = [files.stems[view] for view in trained if files.masks[view] is None]
@@ -174,7 +181,7 @@ def _missing(files: MaskFiles) -> Iterator[Issue]:
             "error",
             "missing",
             f"no training view has a mask in {files.folder}: put id images there, named as the images, or make "
-            "them with: beags masks make",
+            f"them with: {_make(files)}",
             "training stops before its first step (beags-base needs no masks)",
             tuple(without),
         )
@@ -197,7 +204,7 @@ def _no_object(files: MaskFiles, coverage: Coverage) -> Iterator[Issue]:
             "error",
             "no object",
             f"no mask of a training view in {files.folder} names an object, all are background or unlabelled: give "
-            "objects ids above 0, or make masks with: beags masks make",
+            f"objects ids above 0, or make masks with: {_make(files)}",
             "training stops before its first step (beags-base needs no masks)",
         )
 
