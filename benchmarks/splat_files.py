@@ -30,7 +30,7 @@ from beags_plugin.plugin.runs.read import raster_settings, read_assigned_run, tr
 from beags_plugin.rasterizers.interface import MIN_ALPHA
 from beags_plugin.rasterizers.rendering import surfel_inputs
 
-SUFFIXES = {"ply": "ply", "compressed-ply": "compressed.ply", "spz": "spz", "sog": "sog"}
+SUFFIXES = {"ply": "ply", "compressed-ply": "compressed.ply", "spz": "spz", "splat": "splat", "sog": "sog"}
 
 
 def read(path: Path) -> Surfels:

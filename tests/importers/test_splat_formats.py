@@ -274,6 +274,15 @@ def test_what_splat_transform_writes(tmp_path, name, options):
     assert max(found.values()) < 1e-3, found
 
 
+@READ_BY_PLAYCANVAS
+def test_splat_transform_reads_our_splat_file(tmp_path):
+    surfels = random_surfels(count=300)
+    path = write(tmp_path / "cup.splat", "splat", surfels)
+    back = read_scene(converted(path, tmp_path / "back.ply")).gaussians
+    found = differences(read_scene(path).gaussians, replace(back, sh_rest=back.sh_rest[:, :0]))
+    assert found.pop("angles") < 1 and max(found.values()) < 1e-3, found  # it takes bytes for shares of 255
+
+
 def cloud_of(surfels: Surfels) -> dict:
     scales = torch.cat([surfels.log_scales, surfels.log_scales[:, :1] - 3], dim=1)
     quats = torch.nn.functional.normalize(surfels.quats, dim=1)[:, [1, 2, 3, 0]]
