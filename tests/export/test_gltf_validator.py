@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("open3d")
 pytest.importorskip("trimesh")
@@ -19,6 +20,7 @@ pytest.importorskip("trimesh")
 from photographed_box import EYES, a_box, camera_from, photo_of
 from textured_balls import a_ball, texture_of
 
+from beags_plugin.export.base import make_exporter
 from beags_plugin.export.fusion import Mesh
 from beags_plugin.export.glb import glb_bytes
 from beags_plugin.export.texture import textured
@@ -77,6 +79,8 @@ def test_the_validator_finds_nothing(tmp_path, textured, closed):
     invented = mesh.vertices[:, 2] < 2.9 if closed else None
     path = tmp_path / "ball.glb"
     path.write_bytes(glb_bytes(mesh, 'a "cup" of naïve tea', texture_of(mesh) if textured else None, invented))
+    if closed:  # and where map coordinates put it
+        assert make_exporter("glb").to_world(path, torch.tensor([453_211.37, 5_411_873.94, 512.25]).double())
     found = report(path)
     assert found["issues"]["messages"] == [], found["issues"]
     assert found["info"]["totalTriangleCount"] == len(mesh.faces) and found["info"]["hasTextures"] == textured

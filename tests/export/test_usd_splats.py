@@ -184,3 +184,18 @@ def test_what_cannot_be_read_or_written(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="older than 26.3"):
         make_exporter("usda-splats")
     assert usdz.modules("UsdGeom") == [UsdGeom]
+
+
+@KINDS
+@pytest.mark.parametrize("up_axis", ["y", "z"])
+def test_map_coordinates_are_a_shift_of_the_root_in_double_precision(tmp_path, kind, up_axis):
+    surfels, ids = discs()
+    path, exporter = path_of(tmp_path, kind), make_exporter(kind, up_axis=up_axis)
+    exporter.write(path, ExportItem("whole scene", surfels, ids, class_names=NAMES))
+    before = read_scene(path).gaussians.means.double()
+    origin = torch.tensor([453_211.37, 5_411_873.94, 512.25], dtype=torch.float64)
+    assert exporter.to_world(path, origin) and issues(path) == []
+    scene = read_scene(path)
+    assert scene.exact_means is not None and (scene.exact_means - origin - before).abs().max() < 1e-6
+    stage = Usd.Stage.Open(str(path))
+    assert isinstance(stage.GetDefaultPrim().GetAttribute("xformOp:translate").Get(), Gf.Vec3d)
