@@ -108,7 +108,7 @@ mistakes(
         "a layout that the folder is not": lambda at: at.train("beags-data", "--layout", "llff"),
         "an unknown layout": lambda at: at.train("beags-data", "--layout", "polycam"),
         "seed points are text": seed_points(b"hello"),
-        "seed points not numbers": seed_points(HEADER + struct.pack("<6f", 0, 0, 0, NAN, 0, 0)),
+        "seed points not numbers": seed_points(HEADER + struct.pack("<6f", NAN, 0, 0, NAN, 0, 0)),
         "COLMAP's cameras.bin cut off": colmap(lambda model: cut(model / "cameras.bin")),
         "COLMAP's images.bin promises 2^60": colmap(giant("images.bin")),
         "COLMAP's points3D.bin promises 2^60": colmap(giant("points3D.bin")),
