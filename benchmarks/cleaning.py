@@ -47,7 +47,7 @@ def measure(config_path: Path) -> list[Change]:
     run = EvaluatedRun(config_path)
     scene = run.stages["after"]
     surfels, members = scene.surfels().detach(), scene.members
-    cleaner = cleaner_of(scene, config_path)
+    cleaner = cleaner_of(run.run)
     kept, counts = {}, {}
     for class_id in run.classes:
         if class_id and class_id in members.present():

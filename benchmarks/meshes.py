@@ -205,11 +205,10 @@ def measure_one_colour(config_path: Path, objects: Sequence[str]) -> None:
     from beags_plugin.export.page_colors import seen_colors
     from beags_plugin.extraction.select import select_class
     from beags_plugin.plugin.objects.evaluate import EvaluatedRun
-    from beags_plugin.plugin.runs.read import raster_settings, training_viewpoints
 
     run = EvaluatedRun(config_path)
     scene = run.stages["after"]
-    training = training_viewpoints(scene.config, raster_settings(scene), config_path)
+    training = run.run.viewpoints
     ids = {name: class_id for class_id, name in run.classes.items() if class_id}
     for name in objects or ids:
         part, _ = select_class(scene.surfels(), scene.members, ids[name])

@@ -26,7 +26,7 @@ from beags_plugin.extraction.select import select_class
 from beags_plugin.importers.base import read_scene
 from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.plugin.objects.evaluate import EvaluatedRun
-from beags_plugin.plugin.runs.read import raster_settings, read_assigned_run, training_viewpoints
+from beags_plugin.plugin.runs.run import Run
 from beags_plugin.rasterizers.interface import MIN_ALPHA
 from beags_plugin.rasterizers.rendering import surfel_inputs
 
@@ -59,8 +59,8 @@ def psnr(before: Surfels, after: Surfels, cameras: list[Camera], views: Viewpoin
 
 def measure(config_path: Path) -> None:
     """Print the table of one run."""
-    scene = read_assigned_run(config_path)
-    views = training_viewpoints(scene.config, raster_settings(scene), config_path)
+    run = Run(config_path)
+    scene, views = run.assigned, run.viewpoints
     run = EvaluatedRun(config_path)
     cameras, surfels = run.views.cameras("eval"), scene.surfels().detach()
     present = [class_id for class_id in scene.members.present() if class_id != BACKGROUND]

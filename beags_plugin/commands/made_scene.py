@@ -161,8 +161,9 @@ def _check_other(data: Path, scene: Path) -> None:
 
 
 def _has_masks(data: Path) -> bool:
-    from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
+    from beags_plugin.plugin.views.data_options import DataOptions
+    from beags_plugin.plugin.views.scene_data import SceneData
 
-    parser: BeagsDataParser = BeagsDataParserConfig(data=data).setup()
+    parser = SceneData(DataOptions(data=data))
     masks, folder, _ = parser.mask_files(*parser.posed_views())
     return any(masks) or any(folder.glob("**/*.png"))  # training says what is wrong with their names

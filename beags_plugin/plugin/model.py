@@ -19,7 +19,7 @@ from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.class_members import ClassMembers
 from beags_plugin.losses.photometric import psnr, ssim
-from beags_plugin.plugin.options.model_options import fixed_background
+from beags_plugin.plugin.options.scene_options import fixed_background
 from beags_plugin.plugin.training.callbacks import training_callbacks
 from beags_plugin.plugin.training.scene_model import LastRender, SceneModel
 from beags_plugin.plugin.viewer.link import ViewerLink

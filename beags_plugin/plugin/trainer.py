@@ -16,9 +16,11 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.importers.base import find_importer
+from beags_plugin.plugin.objects.clean import decide
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.options.machine import check_machine
 from beags_plugin.plugin.options.rollback import Rollback, noted
+from beags_plugin.plugin.options.run_format import CONFIG_FILE
 from beags_plugin.plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.runs.layout import REPORT_FILE
 from beags_plugin.plugin.training.checkpoints import Checkpoints
@@ -312,6 +314,8 @@ class BeagsTrainer(Trainer):
         self.save_checkpoint(self._done)
         self._complete = True
         self._write_report()
+        if processes.rank() == 0:
+            decide(self.base_dir / CONFIG_FILE)
         super()._after_train()
 
     def _write_report(self) -> None:

@@ -91,10 +91,10 @@ def folder(tmp_path_factory):
     for name in ("run", "other"):
         config = write_trained(root / name, root / "my_scene")
     from beags_plugin.plugin.objects.extract import extract_objects
-    from beags_plugin.plugin.runs.read import read_assigned_run
+    from beags_plugin.plugin.runs.run import Run
 
     extract_objects(config.parent.parent / "run/config.yml", ["cup"])
-    write_ply(root / "scene.ply", read_assigned_run(config).surfels())
+    write_ply(root / "scene.ply", Run(config).assigned.surfels())
     return root
 
 

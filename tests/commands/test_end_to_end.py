@@ -79,10 +79,10 @@ def test_each_loss_has_its_own_curve(trained):
 
 
 def test_the_base_is_kept_apart_and_has_classes(trained):
-    from beags_plugin.plugin.runs.read import read_assigned_run
+    from beags_plugin.plugin.runs.run import Run
 
     folder, _ = trained
-    base, refined = read_assigned_run(folder / "base" / "config.yml"), read_assigned_run(folder / "config.yml")
+    base, refined = Run(folder / "base" / "config.yml").assigned, Run(folder / "config.yml").assigned
     means, moved = base.state["gauss_params.means"], refined.state["gauss_params.means"]
     own = len(means)  # those that close contacts come after them
     assert len(moved) >= own and (base.state["class_ids"] == refined.state["class_ids"][:own]).all()
@@ -100,13 +100,13 @@ def extracted(trained):
 
 def test_extraction_writes_a_run_and_a_ply_per_object(trained, extracted):
     from beags_plugin.plugin.runs.layout import EXTRACTION_FILE
-    from beags_plugin.plugin.runs.read import read_assigned_run
+    from beags_plugin.plugin.runs.run import Run
 
     folder, _ = trained
-    whole = read_assigned_run(folder / "config.yml")
+    whole = Run(folder / "config.yml").assigned
     assert len(extracted) >= 5
     for config in extracted:
-        scene = read_assigned_run(config)
+        scene = Run(config).assigned
         (index,) = scene.state["class_ids"].unique().tolist()
         own = whole.state["class_ids"] == index
         quats = scene.state["gauss_params.quats"]
@@ -163,17 +163,17 @@ def test_export_writes_every_object_and_the_background(trained, tmp_path):
 
 def test_removing_an_object_keeps_the_rest(trained):
     from beags_plugin.plugin.objects.extract import extract_objects
-    from beags_plugin.plugin.runs.read import read_assigned_run
+    from beags_plugin.plugin.runs.run import Run
 
     folder, _ = trained
-    whole = read_assigned_run(folder / "config.yml")
+    whole = Run(folder / "config.yml").assigned
     name = whole.classes[1]
     (rest,) = extract_objects(folder / "config.yml", [name], remove=True)
     assert rest.gaussians == int((whole.state["class_ids"] != 1).sum())
 
 
 def test_refiner_none_leaves_the_scene_as_it_is(trained, data, tmp_path):
-    from beags_plugin.plugin.runs.read import read_assigned_run
+    from beags_plugin.plugin.runs.run import Run
 
     folder, _ = trained
     called(
@@ -181,13 +181,13 @@ def test_refiner_none_leaves_the_scene_as_it_is(trained, data, tmp_path):
         "--load-dir", folder / "base" / "nerfstudio_models", "--pipeline.model.refine-steps", 3,
         "--pipeline.model.refiner", "none",
     )  # fmt: skip
-    base, kept = read_assigned_run(folder / "base" / "config.yml"), read_assigned_run(tmp_path / "none" / "config.yml")
+    base, kept = Run(folder / "base" / "config.yml").assigned, Run(tmp_path / "none" / "config.yml").assigned
     for name in ("means", "quats", "scales", "opacities", "features_dc", "features_rest"):
         assert (base.state[f"gauss_params.{name}"] == kept.state[f"gauss_params.{name}"]).all(), name
 
 
 def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, data, tmp_path):
-    from beags_plugin.plugin.runs.read import read_assigned_run
+    from beags_plugin.plugin.runs.run import Run
 
     folder, _ = trained
     text = called(
@@ -196,7 +196,7 @@ def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, 
         "--pipeline.model.base-steps", 220, "--pipeline.model.refine-steps", 44, "--pipeline.model.prepare.k", 200,
     )  # fmt: skip
     assert "refinement taken up" in text and "Gaussians per class" not in text
-    before, after = read_assigned_run(folder / "config.yml"), read_assigned_run(tmp_path / "resumed" / "config.yml")
+    before, after = Run(folder / "config.yml").assigned, Run(tmp_path / "resumed" / "config.yml").assigned
     assert after.step == 263 and int(after.state["refined_steps"]) == 44
     assert (before.state["class_ids"] == after.state["class_ids"]).all()
     assert (tmp_path / "resumed" / "base" / "config.yml").exists()

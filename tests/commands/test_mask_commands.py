@@ -187,7 +187,7 @@ def test_reprojection_of_a_run_writes_masks_of_the_photos_size(tmp_path, lens, c
 def test_the_check_of_a_run_takes_its_options_and_what_replaces_them(tmp_path):
     from beags_plugin.plugin.objects.check_masks import options_beside
     from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject
-    from beags_plugin.plugin.runs.read import read_run
+    from beags_plugin.plugin.runs.run import Run
 
     data = write_scene(tmp_path / "scene")
     config = write_trained(tmp_path / "run", data)
@@ -196,7 +196,7 @@ def test_the_check_of_a_run_takes_its_options_and_what_replaces_them(tmp_path):
     (data / "masks").rename(data / "others")
     parser = options_beside(config, None, masks_path=Path("others"), ignore_ids=(2,), layout=None)
     assert (parser.layout, parser.orientation_method) == (own.layout, "none")
-    manager = data_to_reproject(read_run(config), config, ReprojectionOptions(run_size=True, parser=parser))
+    manager = data_to_reproject(Run(config), ReprojectionOptions(run_size=True, parser=parser))
     labels = manager.views("train")[0].labels
     assert labels is not None and set(labels.unique().tolist()) == {0, 1, IGNORE}
     main(["masks", "check", "--load-config", str(config), "--masks-path", "others", "--output", str(tmp_path / "out")])

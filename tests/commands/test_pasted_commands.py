@@ -56,12 +56,12 @@ def test_the_command_after_poses(tmp_path, capsys, monkeypatch):
 
 
 def test_the_command_of_a_base_without_classes(tmp_path):
-    from beags_plugin.plugin.runs.read import read_assigned_run
+    from beags_plugin.plugin.runs.run import Run
 
     folder = tmp_path / "my run [1]"
     config = write_trained(folder, write_scene(tmp_path / "scene"), assigned=False)
     with pytest.raises(UserError, match="refine it first") as raised:
-        read_assigned_run(config)
+        _ = Run(config).assigned
     command = re.search(r"\((ns-train .*)\)\.$", str(raised.value))
     assert command is not None
     assert Path(shlex.split(command[1])[-1]).parent == folder

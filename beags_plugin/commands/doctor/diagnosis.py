@@ -37,16 +37,16 @@ def checks_of_data(data: Path | None) -> Iterator[Check]:
         return
     import tempfile
 
-    from beags_plugin.plugin.options.config import base_config
     from beags_plugin.plugin.training.memory_guard import LEAST_FREE_MB, free_disk_mb
-    from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+    from beags_plugin.plugin.views.data_options import DataOptions
+    from beags_plugin.plugin.views.scene_data import SceneData
     from beags_plugin.system.memory import available_mb
 
-    parser = BeagsDataParserConfig(data=data).setup()
-    train, held_out = (len(parser.get_dataparser_outputs(split).cameras) for split in ("train", "val"))
+    scene, output = SceneData(DataOptions(data=data)), Path("outputs")  # nerfstudio's usual folder
+    train, held_out = (len(scene.split(split).cameras) for split in ("train", "val"))
     free = {
         "memory": (available_mb(), "beside this program"),
-        "disk": (free_disk_mb(output := base_config().output_dir), f"for {output}"),
+        "disk": (free_disk_mb(output), f"for {output}"),
         "temporary disk": (free_disk_mb(temporary := Path(tempfile.gettempdir())), f"for {temporary}"),
     }
     yield Check("data", True, f"{train} views to train on, {held_out} held out")
@@ -80,9 +80,10 @@ def _torch() -> Check:
 
 def _nerfstudio() -> Check:
     from importlib.metadata import version
+    from importlib.util import find_spec
 
-    import nerfstudio  # noqa: F401
-
+    if find_spec("nerfstudio") is None:
+        raise ModuleNotFoundError("No module named 'nerfstudio'")
     ok = (found := version("nerfstudio")) == "1.1.5"
     sentence = found if ok else f"{found}, but the plugin is made for 1.1.5"
     return Check("nerfstudio", ok, sentence, repair="" if ok else _REPAIRS["nerfstudio"])

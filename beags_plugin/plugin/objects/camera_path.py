@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
-from nerfstudio.cameras.camera_paths import get_path_from_json
+import torch
 
-from beags_plugin.core.cameras import Camera
-from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+from beags_plugin.core.cameras import Camera, viewmat_from_opengl
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import load_json, reason
 
@@ -25,11 +25,17 @@ def read_camera_path(path: Path) -> tuple[list[Camera], int]:
             raise ValueError(f"it asks for {width} x {height} pixels, {fps} times a second")
         if not 1 <= len(content["camera_path"]) <= _MOST_CAMERAS:
             raise ValueError(f"it has {len(content['camera_path'])} cameras")
-        cameras = get_path_from_json(content)
-        if not (bool(cameras.camera_to_worlds.isfinite().all()) and 0 < float(cameras.fx.min()) < float("inf")):
+        poses = [torch.tensor(each["camera_to_world"]).view(4, 4)[:3].float() for each in content["camera_path"]]
+        focals = [height / 2.0 / math.tan(each["fov"] * (math.pi / 180.0) / 2.0) for each in content["camera_path"]]
+        if not (all(bool(pose.isfinite().all()) for pose in poses) and 0 < min(focals) < math.inf):
             raise ValueError("a pose or a field of view is no number")
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, ArithmeticError) as error:
         raise UserError(
             f"the camera path {path} cannot be read ({reason(error)}): save one in the tab Render of ns-viewer."
         ) from error
-    return [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))], round(fps)
+    return [_camera(pose, focal, width, height) for pose, focal in zip(poses, focals, strict=True)], round(fps)
+
+
+def _camera(pose: torch.Tensor, focal: float, width: int, height: int) -> Camera:
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(viewmat_from_opengl(pose), K, int(width / 2 * 2), int(height / 2 * 2))

@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -24,8 +24,9 @@ from beags_plugin.pictures.masks import Changed, Pointed, contradicted_picture, 
 from beags_plugin.plugin.objects.compare_views import agreements, pointed, points_in_space, tracks_of, turned
 from beags_plugin.plugin.objects.reproject_masks import ReprojectedRun, ReprojectionOptions, reproject_run
 from beags_plugin.plugin.runs.place import open_run
-from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
+from beags_plugin.plugin.views.data_options import DataOptions
 from beags_plugin.plugin.views.poses import PosedViews
+from beags_plugin.plugin.views.scene_data import SceneData
 from beags_plugin.plugin.views.tracks import Tracks, features_of
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import progress_bar
@@ -115,7 +116,7 @@ class Report:
         }
 
 
-def check(parser: BeagsDataParserConfig, few_views: int = FEW_VIEWS, run: Path | None = None) -> Report:
+def check(parser: DataOptions, few_views: int = FEW_VIEWS, run: Path | None = None) -> Report:
     """Check the masks of a scene, with a trained run (its config.yml) also at its depths, if nothing stops training."""
     report = check_scene(parser, few_views)
     if run is not None and not report.stops:
@@ -124,7 +125,7 @@ def check(parser: BeagsDataParserConfig, few_views: int = FEW_VIEWS, run: Path |
     return report
 
 
-def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Report:
+def check_scene(config: DataOptions, few_views: int = FEW_VIEWS) -> Report:
     """Check the masks of the scene that ``config`` names, at the size of the photographs.
 
     Raises ``UserError`` only where poses or photos are bad.
@@ -160,7 +161,7 @@ def check_scene(config: BeagsDataParserConfig, few_views: int = FEW_VIEWS) -> Re
     return report
 
 
-def agreement_of(config: BeagsDataParserConfig) -> tuple[np.ndarray, int]:
+def agreement_of(config: DataOptions) -> tuple[np.ndarray, int]:
     """Return labels [P, V] of points in space in every view (``consistency.Agreement``) and the number of classes."""
     scene, views, files = _files(config)
     coverage = check_files(files)
@@ -168,8 +169,8 @@ def agreement_of(config: BeagsDataParserConfig) -> tuple[np.ndarray, int]:
     return agreements(files, coverage, views, points, [])[0].labels, len(coverage.ids)
 
 
-def _files(config: BeagsDataParserConfig) -> tuple[Dataset, PosedViews, MaskFiles]:
-    parser: BeagsDataParser = config.setup()
+def _files(config: DataOptions) -> tuple[Dataset, PosedViews, MaskFiles]:
+    parser = SceneData(config)
     scene, views = parser.posed_views()
     sizes = [image_size(path) for path in views.images]
     parser.fit_cameras(views, sizes)
@@ -252,23 +253,21 @@ def write_contradictions(report: Report, output: Path) -> list[Path]:
     return [picture]
 
 
-def options_beside(run: Path | None, data: Path | None, **given: Any) -> BeagsDataParserConfig:
+def options_beside(run: Path | None, data: Path | None, **given: Any) -> DataOptions:
     """Return the data parser's options of a run, or the usual ones without any, replaced by those given that are not
     None.
 
     run: config.yml. data: folder of the scene, that of the run if None.
     """
-    config = BeagsDataParserConfig()
+    config = DataOptions()
     if run is not None:
         trained = open_run(run, data)
-        config = replace(cast("BeagsDataParserConfig", trained.data_config.dataparser), data=trained.data_path)
+        config = replace(trained.data_config.dataparser, data=trained.data_path)
     if data is not None:
         config = replace(config, data=data)
     return replace(config, **{name: value for name, value in given.items() if value is not None})
 
 
-def data_options(
-    data: Path, layout: str = "auto", images_path: Path | None = None, **given: Any
-) -> BeagsDataParserConfig:
+def data_options(data: Path, layout: str = "auto", images_path: Path | None = None, **given: Any) -> DataOptions:
     """Return the data parser's options of a scene without a run; given: as of ``options_beside``."""
     return options_beside(None, data, layout=layout, images_path=images_path, **given)

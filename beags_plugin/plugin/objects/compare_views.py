@@ -14,7 +14,7 @@ from beags_plugin.masks.check.files import Coverage, MaskFiles
 from beags_plugin.masks.check.issues import Issue, percent
 from beags_plugin.pictures.masks import Pointed
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
-from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+from beags_plugin.plugin.views.data_options import DataOptions
 from beags_plugin.plugin.views.lens import project_through_lens
 from beags_plugin.plugin.views.poses import PosedViews
 from beags_plugin.plugin.views.seed_points import random_points, starting_points
@@ -27,7 +27,7 @@ MOST_SEED_POINTS = 100_000
 MOST_COUNTS = 30_000_000  # points times classes, or times views, that are held at a time
 
 
-def points_in_space(scene: Dataset, views: PosedViews, config: BeagsDataParserConfig) -> np.ndarray:
+def points_in_space(scene: Dataset, views: PosedViews, config: DataOptions) -> np.ndarray:
     """Return [P, 3] float64 in the cameras' world: seed points, and random points where the cameras look."""
     found = starting_points(scene, views, config.num_random_points)
     seeds = found["points3D_xyz"].double().numpy()

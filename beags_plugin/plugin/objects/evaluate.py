@@ -16,13 +16,12 @@ from beags_plugin.evaluation.report import RunMetrics, Stage
 from beags_plugin.evaluation.run_metrics import evaluate_scene
 from beags_plugin.evaluation.shown import shown_pixels
 from beags_plugin.pictures.worst_views import WorstMask, draw_worst
-from beags_plugin.plugin.options.config import BeagsTrainerConfig
-from beags_plugin.plugin.options.model_options import fixed_background
+from beags_plugin.plugin.options.scene_options import fixed_background
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, EXTRACTION_FILE
-from beags_plugin.plugin.runs.read import SavedScene, data_of_run, raster_settings, read_run
+from beags_plugin.plugin.runs.read import SavedScene, read_run
+from beags_plugin.plugin.runs.run import Run
+from beags_plugin.plugin.runs.run_config import RunConfig
 from beags_plugin.plugin.views.held_out_views import HeldOutViews
-from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.interface import Rasterizer
 
 Progress = Callable[[int, int], None]
 
@@ -52,7 +51,8 @@ class EvaluatedRun:
 
     def __init__(self, config_path: Path, name: str = "", data: Path | None = None) -> None:
         self.config_path = Path(config_path)
-        after = read_run(self.config_path, data)
+        self.run = Run(self.config_path, data)
+        after = self.run.scene
         self.stages: dict[Stage, SavedScene] = {"after": after}
         snapshot = self.config_path.parent / BASE_SNAPSHOT / "config.yml"
         if after.assigned and snapshot.exists() and (before := read_run(snapshot)).assigned:
@@ -65,15 +65,12 @@ class EvaluatedRun:
             self.classes = {c: each for c, each in after.classes.items() if c in present}
         self.name = name or scene_name(after.config)
         self.colors_fitted = any(scene.exposures is not None for scene in self.stages.values())
-        self.settings = raster_settings(after)
-        self.rasterizer: Rasterizer = make_rasterizer(after.config.model_config.rasterizer)
+        self.settings, self.rasterizer = self.run.settings, self.run.rasterizer
 
     @cached_property
     def views(self) -> HeldOutViews:
         """Return the held-out views; raises ``UserError`` if the run's data cannot be read."""
-        config = self.stages["after"].config
-        manager = data_of_run(config, self.config_path, split="test")
-        return HeldOutViews(manager, self.classes, fixed_background(config.model_config))
+        return HeldOutViews(self.run.views("test"), self.classes, fixed_background(self.run.config.model_config))
 
     def shown(self) -> list[Tensor]:
         """Return which pixels of each held-out view training photos show, by the depth of the first stage.
@@ -150,7 +147,7 @@ class EvaluatedRun:
             yield f"{trained_on} of these {len(self.views)} views were trained on, so the figures flatter the run."
 
 
-def scene_name(config: BeagsTrainerConfig) -> str:
+def scene_name(config: RunConfig) -> str:
     """Return the name of the folder of the run's data; of the one above, where it is called as every scene could be."""
     folder = config.data_path.absolute()
     folder = folder.parent if folder.suffix == ".json" else folder

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import suppress
+from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,13 @@ from torch import Tensor
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export import EXPORTERS
 from beags_plugin.export.base import Exporter, ExportItem, make_exporter
-from beags_plugin.export.frames import Frame, check_placement
+from beags_plugin.export.frames import check_placement
 from beags_plugin.export.mesh import open3d_missing
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.pose_options import PoseOptions
 from beags_plugin.extraction.far_worlds import local_origin, said_of_far, unlist, write_origin
 from beags_plugin.extraction.files import whole_file
+from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.plugin.objects.export_job import ExportJob, Progress, Shown, Steps
 from beags_plugin.plugin.objects.exported import Exported, ExportedFile
 from beags_plugin.plugin.objects.extract import (
@@ -30,14 +32,7 @@ from beags_plugin.plugin.objects.extract import (
     said_of_empty,
 )
 from beags_plugin.plugin.objects.pose import metres_per_unit
-from beags_plugin.plugin.runs.place import open_run
-from beags_plugin.plugin.runs.read import (
-    raster_settings,
-    read_assigned_run,
-    read_run,
-    read_transform,
-    training_viewpoints,
-)
+from beags_plugin.plugin.runs.run import Run
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.reading.text import load_json
@@ -66,27 +61,28 @@ def export_run(
 ) -> list[Exported]:
     """Write files of objects of a run.
 
-    config_path: config.yml of a refined (or assigned) run. objects: names; or everything: all that have Gaussians and
-    the emptied background, and a manifest. whole: the whole scene too, in one file; alone it needs no classes. formats:
-    names of exporters. placement: "world", the frame of the input poses (the run's own if it has not kept how that was
-    normalised), or "object", the same centred on each object. output: folder; ``exports/`` in the run by default.
-    options: format to its exporter's options. progress: receives (done, total) files, and rendered views of the meshes
-    among them. data: if not where they were. keep_all: keep Gaussians too that do not belong to their object
-    (``cleaning.clean``); the background and the whole scene are kept as they are. pose: where objects stand and how
-    large they are. closing: close objects where no photo shows them, by the surface that these options lead to; the
-    background and the whole scene are not closed. say: receives a sentence on objects without Gaussians, if everything
-    is asked for. Raises ``UserError`` for a mistake, before anything is written.
+    config_path: config.yml of a refined (or assigned) run. objects: names; or everything: all that have Gaussians, then
+    the emptied background, which gets no mesh, and a manifest. whole: the whole scene too, in one file; alone it needs
+    no classes. formats: names of exporters. placement: "world", the frame of the input poses (the run's own
+    if it has not kept how that was normalised), or "object", the same centred on each object. output: folder;
+    ``exports/`` in the run by default. options: format to its exporter's options. progress: receives (done, total)
+    files, and rendered views of the meshes among them. data: if not where they were. keep_all: keep Gaussians too that
+    do not belong to their object (``cleaning.clean``); the background and the whole scene are kept as they are. pose:
+    where objects stand and how large they are. closing: close objects where no photo shows them, by the surface that
+    these options lead to; the background and the whole scene are not closed. say: receives a sentence on objects
+    without Gaussians, if everything is asked for. Raises ``UserError`` for a mistake, before anything is written.
     """
-    run, folder, pose = config_path.parent, output or config_path.parent / "exports", pose or PoseOptions()
+    run, folder, pose = Run(config_path, data), output or config_path.parent / "exports", pose or PoseOptions()
     check_placement(placement)
     if pose.centre and placement == "object":
         raise UserError("--centre puts the origin under objects, --frame object into their middle: leave one out.")
     exporters = {name: make_exporter(name, **(options or {}).get(name, {})) for name in formats}
+    # Quick formats first: splats, then what renders views, then meshes with textures from photos.
+    exporters = dict(sorted(exporters.items(), key=lambda named: (named[1].needs_photos, named[1].needs_views)))
     if not exporters:
         raise UserError("no format is named: name one with --format.")
-    read = read_assigned_run if everything or objects or not whole else read_run
-    scene = read(config_path, data)
-    present = objects_with_gaussians(scene, objects, run) if scene.assigned else {}
+    scene = run.assigned if everything or objects or not whole else run.scene
+    present = objects_with_gaussians(scene, objects, run.folder) if scene.assigned else {}
     if everything and objects:
         raise UserError("--all exports every object: leave --object out.")
     if not (everything or objects or whole):
@@ -95,22 +91,21 @@ def export_run(
         )
     for name, exporter in exporters.items():
         _check_size(name, exporter, pose, 'with --scale-by, such as "frame_0012:340,215 frame_0012:512,220 12 cm".')
-    transform = read_transform(run)
-    frame = Frame.of_run() if transform is None else Frame(*transform)
-    views = None
+    transform, frame, views = run.transform, run.frame, None
     if closing is not None and (reason := open3d_missing()):
         raise UserError(f"objects cannot be closed here: {reason}")
     if closing is not None or any(exporter.needs_views for exporter in exporters.values()):
-        views = training_viewpoints(scene.config, raster_settings(scene), config_path)
-    names = list(present) if everything else list(dict.fromkeys(objects))
+        views = run.viewpoints
+    objects_first = sorted(present, key=lambda name: present[name] == BACKGROUND)
+    names = objects_first if everything else list(dict.fromkeys(objects))
     whole_title = file_name(WHOLE)
     titles = folder_names(scene.classes, [whole_title])  # an object may be called so too
     metres = None
     if (length := pose.length()) is not None:
-        metres = metres_per_unit(length, config_path, frame, scene)
+        metres = metres_per_unit(length, run, frame)
     origin = local_origin(*transform) if transform is not None else None
     posed = placement == "object" or pose != PoseOptions()
-    shown = Shown(scene, config_path)
+    shown = Shown(run)
     cleaner = None if keep_all or not any(map(present.get, names)) else shown.cleaner()
     job = ExportJob(
         scene, exporters, frame, metres, placement == "object", pose, views, everything, cleaner, shown, closing,
@@ -130,7 +125,7 @@ def export_run(
     elif origin is not None and placement == "world" and not pose.centre:
         say(said_of_far(origin, False, False))
     if everything:
-        empty = empty_objects(scene, run)
+        empty = empty_objects(scene, run.folder)
         world = "run" if transform is None else "input"
         content = {
             "run": str(config_path.absolute()),
@@ -205,17 +200,16 @@ def export_shown(
     _check_size(format_name, exporter, pose, "in the tab Size.")
     if len(surfels) == 0:
         raise UserError("nothing is shown, so there is nothing to export: show an object, or lower the least opacity.")
-    transform = read_transform(config_path.parent)
-    frame = Frame.of_run() if transform is None else Frame(*transform)
-    origin = None if transform is None else local_origin(*transform)
+    run = Run(config_path)
+    frame, origin = run.frame, None if run.transform is None else local_origin(*run.transform)
     if origin is not None:
         frame = frame.centred(origin)
     if (length := pose.length()) is not None:
         given = frame if origin is None else frame.centred(-origin)  # points are told in the world's coordinates
-        frame = frame.scaled(metres_per_unit(length, config_path, given))
+        frame = frame.scaled(metres_per_unit(length, run, given))
     views = None
     if exporter.needs_views:
-        views = frame.views(training_viewpoints(open_run(config_path), settings, config_path))
+        views = frame.views(replace(run.viewpoints, settings=settings))
     path = _free_path(config_path.parent / "exports", title, exporter.suffix)
     total = 0 if views is None else len(views.cameras)
     item = ExportItem(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from beags_plugin.cleaning.silhouettes import MaskedViews
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import Exporter, ExportItem, NothingToExport, Photo, Viewpoints
 from beags_plugin.export.closing_surfels import with_closing
@@ -23,7 +24,9 @@ from beags_plugin.plugin.objects.exported import Exported, ExportedFile
 from beags_plugin.plugin.objects.photos import photos_of
 from beags_plugin.plugin.objects.pose import plane_under
 from beags_plugin.plugin.objects.shown import ShownScene, Unshown, shown_scene
+from beags_plugin.plugin.runs.belonging import Belonging
 from beags_plugin.plugin.runs.read import SavedScene
+from beags_plugin.plugin.runs.run import Run
 
 Progress = Callable[[int, int], None]
 
@@ -53,13 +56,13 @@ class Steps:
 class Shown:
     """What the training views of a run show, read when it is first asked for."""
 
-    def __init__(self, scene: SavedScene, config_path: Path) -> None:
-        self._scene, self._config_path = scene, config_path
+    def __init__(self, run: Run) -> None:
+        self._run = run
 
     @cached_property
     def _found(self) -> ShownScene | str:
         try:
-            return shown_scene(self._scene, self._config_path)
+            return shown_scene(self._run)
         except Unshown as doubt:
             return str(doubt)
 
@@ -69,8 +72,12 @@ class Shown:
 
     def cleaner(self) -> Cleaner:
         """Return what decides which Gaussians belong to objects."""
-        found, doubt = self.scene()
-        return Cleaner(None if found is None else found.views, doubt)
+
+        def views() -> tuple[MaskedViews | None, str]:
+            found, doubt = self.scene()
+            return (None if found is None else found.views), doubt
+
+        return Cleaner(views, Belonging(self._run.scene, self._run.folder))
 
 
 @dataclass(frozen=True)
@@ -139,7 +146,7 @@ class ExportJob:
             path = stem.with_name(f"{stem.name}.{exporter.suffix}")
             of_file = of_splats if exporter.holds_gaussians else item
             files.append(
-                self._write(label, exporter, path, of_file)
+                self._write(label, exporter, path, of_file, class_id)
                 if doubt is None
                 else ExportedFile(label, None, {}, str(doubt))
             )
@@ -184,7 +191,12 @@ class ExportJob:
         shown, doubt = self.shown.scene()
         return (None, doubt) if shown is None else (photos_of(shown, class_id, frame), "")
 
-    def _write(self, label: str, exporter: Exporter, path: Path, item: ExportItem) -> ExportedFile:
+    def _write(
+        self, label: str, exporter: Exporter, path: Path, item: ExportItem, class_id: int | None
+    ) -> ExportedFile:
+        if self.tolerant and exporter.needs_photos and class_id == BACKGROUND:
+            reason = "a mesh of the background takes long: name it, with --object, where it is wanted"
+            return ExportedFile(label, None, {}, reason)
         try:
             facts = exporter.write(path, item)
             if self.shift is not None:

@@ -22,7 +22,8 @@ from beags_plugin.extraction.select import remove_class, select_class
 from beags_plugin.plugin.objects.clean import cleaner_of
 from beags_plugin.plugin.runs.checkpoint_file import exposures_of, extra_state
 from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, digest_of_prepared
-from beags_plugin.plugin.runs.read import SavedScene, read_assigned_run, read_transform
+from beags_plugin.plugin.runs.read import SavedScene
+from beags_plugin.plugin.runs.run import Run
 from beags_plugin.plugin.runs.write import write_run
 from beags_plugin.system.errors import UserError, check_choice, writing
 from beags_plugin.system.whole_files import write_text_atomically
@@ -62,11 +63,12 @@ def extract_objects(
     receives a sentence on objects without Gaussians, if all are asked for. Raises ``UserError`` for an unknown name,
     before anything is written.
     """
-    scene = read_assigned_run(config_path, data)
-    run, members = config_path.parent, scene.members
+    opened = Run(config_path, data)
+    scene, run = opened.assigned, opened.folder
+    members = scene.members
     ids = objects_with_gaussians(scene, objects, run)
     names = list(objects) or [name for name, index in ids.items() if index != 0]
-    transform = read_transform(run)
+    transform = opened.transform
     amid = None if transform is None else local_origin(*transform)
     if transform is not None and amid is not None:
         transform = about(transform[0], amid), transform[1]
@@ -74,7 +76,7 @@ def extract_objects(
     folders, target = folder_names(scene.classes), output or run / "extracted"
     with writing(target):
         target.mkdir(parents=True, exist_ok=True)
-    cleaner = None if keep_all or remove else cleaner_of(scene, config_path)
+    cleaner = None if keep_all or remove else cleaner_of(opened)
     prepared = digest_of_prepared(run)  # shows later if the run was trained again
     written = []
     for name in names:

@@ -17,7 +17,8 @@ from beags_plugin.data.files import image_size, same_proportions
 from beags_plugin.data.layouts.llff import camera_names
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import UNTOLD, read_object_mask, write_mask
-from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
+from beags_plugin.plugin.views.data_options import DataOptions
+from beags_plugin.plugin.views.scene_data import SceneData
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.pasted import quoted
 from beags_plugin.system.whole_files import write_text_atomically
@@ -25,16 +26,14 @@ from beags_plugin.system.whole_files import write_text_atomically
 PROMPTS = "prompts.json"
 
 
-def import_truth(
-    data: BeagsDataParserConfig, objects: Sequence[DownloadedObject], overwrite: bool = False
-) -> list[str]:
+def import_truth(data: DataOptions, objects: Sequence[DownloadedObject], overwrite: bool = False) -> list[str]:
     """Write visible masks to ground_truth/visible/<object>/<photo>.png, and scribbles to prompts.json, of a scene.
 
     Masks keep their size. data: names the scene. overwrite: replace files that are there. Returns lines that report
     it. Raises ``UserError`` before anything is written: for no photo of a mask's name, or masks in other proportions.
     """
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
-        parser = BeagsDataParser(data)
+        parser = SceneData(data)
         scene, views = parser.posed_views()
         held_out = {views.images[index] for index in parser.views_of_split(views, "test")}
     photos = {image.stem: image for image in views.images}

@@ -27,9 +27,9 @@ from beags_plugin.pictures.masks import overlay
 from beags_plugin.plugin.objects.check_masks import check, options_beside, write_contradictions
 from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
 from beags_plugin.plugin.runs.place import open_run
-from beags_plugin.plugin.runs.read import raster_settings, read_run, read_transform
-from beags_plugin.plugin.views.dataparser import BeagsDataParser, BeagsDataParserConfig
-from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.plugin.runs.run import Run
+from beags_plugin.plugin.views.data_options import DataOptions
+from beags_plugin.plugin.views.scene_data import SceneData
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
 from beags_plugin.system.errors import UserError, check_choice, writing
 from beags_plugin.system.progress import progress_bar
@@ -41,8 +41,8 @@ class RunGeometry:
 
     def __init__(self, config_path: Path, data: Path | None = None) -> None:
         self.folder = config_path.parent
-        self.scene = read_run(config_path, None if open_run(config_path).data_path.exists() else data)
-        self.manager = data_to_reproject(self.scene, config_path, ReprojectionOptions())
+        self.run = Run(config_path, None if open_run(config_path).data_path.exists() else data)
+        self.manager = data_to_reproject(self.run, ReprojectionOptions())
         self.images = list(self.manager.train_dataset.image_filenames)
         self.cameras = [view.camera for view in self.manager.views("train")]
         self._of_split: list[tuple[Literal["train", "eval"], int]] = [("train", i) for i in range(len(self.images))]
@@ -52,26 +52,25 @@ class RunGeometry:
                 self._of_split.append(("eval", index))
                 self.images.append(image)
                 self.cameras.append(view.camera)
-        self.rasterizer = make_rasterizer(self.scene.config.model_config.rasterizer)
-        self.settings = raster_settings(self.scene)
+        self.rasterizer, self.settings = self.run.rasterizer, self.run.settings
 
     @cached_property
     def _surfels(self):
-        return geometry_inputs(self.scene.surfels())
+        return geometry_inputs(self.run.scene.surfels())
 
     def surfels(self) -> Surfels:
         """Return the N Gaussians, in the run's frame."""
-        return self.scene.surfels()
+        return self.run.scene.surfels()
 
     def input_means(self) -> Tensor:
         """Return the centres of the Gaussians, [N, 3] float64, in the frame of the input poses."""
-        transform, scale = read_transform(self.folder) or (torch.eye(3, 4, dtype=torch.float64), 1.0)
+        transform, scale = self.run.transform or (torch.eye(3, 4, dtype=torch.float64), 1.0)
         means = self.surfels().means.detach().double().cpu()
         return (means / scale - transform[:, 3]) @ transform[:, :3]  # in double: the world may lie far from 0
 
     def depth(self, view: int) -> Tensor:
         """Return [h, w] float32."""
-        kind = self.scene.config.model_config.prepare.depth
+        kind = self.run.config.model_config.prepare.depth
         with torch.no_grad():
             render = self.rasterizer.rasterize(self._surfels, self.cameras[view], self.settings, torch.zeros(3))
             return surface_depth(render, kind)
@@ -116,7 +115,7 @@ def configured_source(name: str, options: Sequence[str]) -> MaskSource:
 
 
 def make_masks(
-    data: BeagsDataParserConfig,
+    data: DataOptions,
     source: MaskSource,
     run: Path | None = None,
     output: Path | None = None,
@@ -218,14 +217,14 @@ def make_masks(
     ]
 
 
-def _photos(data: BeagsDataParserConfig, source: MaskSource) -> tuple[Path, list[Path], set[int], bool]:
+def _photos(data: DataOptions, source: MaskSource) -> tuple[Path, list[Path], set[int], bool]:
     """Return the scene's folder, its photos, which of them are for training, and whether they have poses."""
     root = Path(data.data).absolute()
     if data.layout == "auto" and not source.needs_run and root.is_dir() and not fitting_layouts(root):
         found = list_photos(root)
         if found:
             return root, found, set(range(len(found))), False
-    parser: BeagsDataParser = data.setup()
+    parser = SceneData(data)
     scene, views = parser.posed_views()
     return scene.root, list(views.images), set(parser.views_of_split(views, "train")), True
 

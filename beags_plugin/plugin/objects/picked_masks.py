@@ -13,7 +13,7 @@ from beags_plugin.picking.source import DrawnSource
 from beags_plugin.plugin.objects.check_masks import options_beside
 from beags_plugin.plugin.objects.make_masks import make_masks
 from beags_plugin.plugin.runs.place import open_run
-from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+from beags_plugin.plugin.views.data_options import DataOptions
 from beags_plugin.system.digests import content_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.pasted import command
@@ -74,12 +74,12 @@ def save_masks(
     return SavedMasks(said, command(words))
 
 
-def option_words(parser: BeagsDataParserConfig) -> list[str]:
+def option_words(parser: DataOptions) -> list[str]:
     """Return the options of ``beags-data`` that make a data parser, as words of a command; none for the usual ones.
 
     Those that the command line does not offer are left out.
     """
-    usual, words = BeagsDataParserConfig(), []
+    usual, words = DataOptions(), []
     for field in fields(parser):
         value = getattr(parser, field.name)
         hidden = str(field.type).startswith("Suppress") or field.name in ("_target", "data")

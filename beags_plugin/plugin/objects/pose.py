@@ -17,11 +17,10 @@ from beags_plugin.export.pose_options import KnownLength, PhotoPoint, Point
 from beags_plugin.export.standing import Plane, standing_plane
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.objects.shown import ShownScene
-from beags_plugin.plugin.runs.read import SavedScene, data_of_run, raster_settings, read_run
-from beags_plugin.plugin.views.datamanager import BeagsDataManager, Split
-from beags_plugin.plugin.views.dataset import BeagsDataset
+from beags_plugin.plugin.runs.run import Run
+from beags_plugin.plugin.views.run_data import RunData, Split
+from beags_plugin.plugin.views.split_photos import SplitPhotos
 from beags_plugin.plugin.views.views import unique_names
-from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
 from beags_plugin.system.errors import UserError, meant
 
@@ -57,33 +56,25 @@ def plane_under(name: str, part: Surfels, class_id: int, shown: ShownScene, fram
     return plane
 
 
-def metres_per_unit(length: KnownLength, config_path: Path, world: Frame, scene: SavedScene | None = None) -> float:
+def metres_per_unit(length: KnownLength, run: Run, world: Frame) -> float:
     """Return how many metres a unit of ``world`` is, by a known length in it.
 
-    scene: of the run, which is read if photos need it and it is None. Raises ``UserError`` for a photo or pixel that is
-    not there, or points that coincide.
+    Raises ``UserError`` for a photo or pixel that is not there, or points that coincide.
     """
-    manager = None
-    if any(isinstance(point, PhotoPoint) for point in (length.first, length.second)):
-        scene = scene or read_run(config_path)
-        manager = data_of_run(scene.config, config_path, split="test")
-    first, second = (_place(point, scene, manager, world) for point in (length.first, length.second))
+    first, second = (_place(point, run, world) for point in (length.first, length.second))
     apart = float((first - second).norm())
     if not apart > 0:
         raise UserError("the two points of scale_by are the same: give two that are apart.")
     return length.metres / apart
 
 
-def _place(point: Point, scene: SavedScene | None, manager: BeagsDataManager | None, world: Frame) -> Tensor:
+def _place(point: Point, run: Run, world: Frame) -> Tensor:
     """Return the place [3] float64 of a point in ``world``."""
     if not isinstance(point, PhotoPoint):
         return torch.tensor(point, dtype=torch.float64)
-    assert scene is not None and manager is not None
-    camera, x, y = _pixel(point, manager)
-    surfels = scene.surfels().detach()
-    render = make_rasterizer(scene.config.model_config.rasterizer).rasterize(
-        geometry_inputs(surfels), camera, raster_settings(scene), surfels.means.new_zeros(3)
-    )
+    camera, x, y = _pixel(point, run.views("test"))
+    surfels = run.scene.surfels().detach()
+    render = run.rasterizer.rasterize(geometry_inputs(surfels), camera, run.settings, surfels.means.new_zeros(3))
     depth = float(surface_depth(render, "median")[int(y), int(x)])
     if not depth > 0:
         raise UserError(f"nothing solid is at {point.view}:{point.x:g},{point.y:g}: choose another pixel of scale_by.")
@@ -92,9 +83,9 @@ def _place(point: Point, scene: SavedScene | None, manager: BeagsDataManager | N
     return world.points(in_run[None])[0]
 
 
-def _pixel(point: PhotoPoint, manager: BeagsDataManager) -> tuple[Camera, float, float]:
+def _pixel(point: PhotoPoint, manager: RunData) -> tuple[Camera, float, float]:
     """Return the straight camera of a photo, and where the pixel of its file is in it (centres at + 0.5)."""
-    datasets: dict[Split, BeagsDataset] = {"train": manager.train_dataset, "eval": manager.eval_dataset}
+    datasets: dict[Split, SplitPhotos] = {"train": manager.train_dataset, "eval": manager.eval_dataset}
     files: dict[Path, tuple[Split, int]] = {}  # without held-out photos, both splits have the same
     for split, dataset in datasets.items():
         for index, file in enumerate(dataset.image_filenames):

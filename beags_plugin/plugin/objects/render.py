@@ -20,8 +20,8 @@ from beags_plugin.plugin.objects.camera_path import read_camera_path
 from beags_plugin.plugin.objects.export import Progress
 from beags_plugin.plugin.objects.extract import folder_names, objects_with_gaussians
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT
-from beags_plugin.plugin.runs.read import SavedScene, raster_settings, read_assigned_run, read_run, training_viewpoints
-from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.plugin.runs.read import SavedScene
+from beags_plugin.plugin.runs.run import Run
 from beags_plugin.system.errors import UserError, check_choice
 
 _PICTURES = (".png", ".jpg", ".jpeg")
@@ -48,7 +48,8 @@ def render_run(
     check_choice(form, get_args(PictureFormat), "format")
     if options.camera_path is not None:
         return _along(options.camera_path, config_path, objects, form, output, options, progress)
-    scene = read_assigned_run(config_path, data)
+    run = Run(config_path, data)
+    scene = run.assigned
     present = objects_with_gaussians(scene, objects, config_path.parent)
     names = list(dict.fromkeys(objects)) or [name for name, class_id in present.items() if class_id != 0]
     if not names:
@@ -59,13 +60,12 @@ def render_run(
         output = config_path.parent / "renders" / f"{title}_{form}{suffix}"
     moving = _check_output(output, form)
     stages = {"": scene} if form != "before-after" else {"before": _base_of(config_path), "after": scene}
-    subjects = _subjects(config_path, stages, names, present, form, moving, options)
-    rasterizer = make_rasterizer(scene.config.model_config.rasterizer)
+    subjects = _subjects(run, stages, names, present, form, moving, options)
     if moving:
-        write_film(output, film(subjects, rasterizer, options.background, progress), options.fps)
+        write_film(output, film(subjects, run.rasterizer, options.background, progress), options.fps)
     else:
         draw = comparison if form == "before-after" else sheet
-        write_picture(output, draw(subjects, rasterizer, options.background, progress))
+        write_picture(output, draw(subjects, run.rasterizer, options.background, progress))
     return output
 
 
@@ -91,7 +91,8 @@ def _along(
     cameras, fps = read_camera_path(path)
     output = output or config_path.parent / "renders" / f"{path.stem}_{form}{_film_suffix()}"
     check_film(output)
-    scene = read_assigned_run(config_path) if objects or form != "video" else read_run(config_path)
+    run = Run(config_path)
+    scene = run.assigned if objects or form != "video" else run.scene
     stages = {"": scene} if form == "video" else {"before": _base_of(config_path), "after": scene}
     present = objects_with_gaussians(scene, objects, config_path.parent) if objects else {}
     shown = {}
@@ -99,9 +100,8 @@ def _along(
         surfels, members = each.surfels(), each.members
         chosen = [members.of(present[name]) for name in objects]
         shown[caption] = surfels[torch.stack(chosen).any(dim=0)] if chosen else surfels
-    subject = Subject("", shown, cameras, raster_settings(scene))
-    rasterizer = make_rasterizer(scene.config.model_config.rasterizer)
-    write_film(output, film([subject], rasterizer, options.background, progress), fps)
+    subject = Subject("", shown, cameras, run.settings)
+    write_film(output, film([subject], run.rasterizer, options.background, progress), fps)
     return output
 
 
@@ -125,11 +125,11 @@ def _base_of(config_path: Path) -> SavedScene:
             f"{config_path.parent} has kept no state before refinement ({BASE_SNAPSHOT}/): name the run that was "
             "refined, or another --format."
         )
-    return read_assigned_run(snapshot)
+    return Run(snapshot).assigned
 
 
 def _subjects(
-    config_path: Path,
+    run: Run,
     stages: dict[str, SavedScene],
     names: Sequence[str],
     present: dict[str, int],
@@ -137,9 +137,8 @@ def _subjects(
     moving: bool,
     options: RenderOptions,
 ) -> list[Subject]:
-    last = list(stages.values())[-1]
     try:
-        photos = training_viewpoints(last.config, raster_settings(last), config_path).cameras
+        photos = run.viewpoints.cameras
     except UserError:  # the data are gone: nerfstudio's frame has z up
         photos = []
     count = options.frames if moving else options.views

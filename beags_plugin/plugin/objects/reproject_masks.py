@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -19,18 +19,17 @@ from beags_plugin.labels.classes import write_mask
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.pictures.masks import Changed, before_and_after
 from beags_plugin.plugin.runs.place import check_data
-from beags_plugin.plugin.runs.read import raster_settings, read_run
+from beags_plugin.plugin.runs.run import Run
+from beags_plugin.plugin.views.run_data import RunData
 from beags_plugin.preparation.consistent_masks import chosen_reprojection, render_depths, reprojected_masks
 from beags_plugin.preparation.pipeline import known_classes
-from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.filed_tensors import filed
 from beags_plugin.system.progress import counted, progress_bar
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.runs.read import SavedScene
-    from beags_plugin.plugin.views.datamanager import BeagsDataManager
-    from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+    from beags_plugin.plugin.views.data_options import DataOptions
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class ReprojectionOptions:
     tau: float | None = None
     depth: str | None = None
     run_size: bool = False
-    parser: BeagsDataParserConfig | None = None
+    parser: DataOptions | None = None
     data: Path | None = None
 
 
@@ -61,7 +60,7 @@ class ReprojectedRun:
     """
 
     scene: SavedScene
-    manager: BeagsDataManager
+    manager: RunData
     names: list[str]
     classes: dict[int, str]
     given: LabelMaps
@@ -90,8 +89,8 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     config_path: config.yml of any run. Raises ``UserError`` for a run, data or an option that cannot be used, and if no
     view has a mask.
     """
-    scene = read_run(config_path, options.data)
-    manager = data_to_reproject(scene, config_path, options)
+    run = Run(config_path, options.data)
+    scene, manager = run.scene, data_to_reproject(run, options)
     own = {"reprojection": options.method, "tau": options.tau, "depth": options.depth}
     config = replace(scene.config.model_config.prepare, **{k: v for k, v in own.items() if v is not None})
     if config.reprojection == "none":
@@ -104,12 +103,12 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     if all(mask is None for mask in given.stored):
         raise UserError(f"no training view of {scene.config.data_path} has a mask: give --masks-path, or make some.")
     classes = manager.train_dataset.metadata["classes"]
-    cameras, rasterizer = [view.camera for view in views], make_rasterizer(scene.config.model_config.rasterizer)
+    cameras = [view.camera for view in views]
     method, why = chosen_reprojection(config.reprojection, cameras, given)
     config = replace(config, reprojection=method)
     with progress_bar("Rendering depth") as progress:
         surfels = scene.surfels().detach()
-        rendered = render_depths(surfels, cameras, rasterizer, raster_settings(scene), config.depth, progress)
+        rendered = render_depths(surfels, cameras, run.rasterizer, run.settings, config.depth, progress)
         depths = filed(rendered, surfels.means.device)
     with progress_bar("Reprojecting masks") as progress:
         known = known_classes(given, classes)
@@ -120,14 +119,14 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     return ReprojectedRun(scene, manager, names, classes, given, masks.labels, masks.confidence, seconds, method, why)
 
 
-def data_to_reproject(scene: SavedScene, config_path: Path, options: ReprojectionOptions) -> BeagsDataManager:
+def data_to_reproject(run: Run, options: ReprojectionOptions) -> RunData:
     """Return the data that a run was trained on, at the size and with the masks of ``options``."""
-    config = scene.config
+    config = run.config
     if options.parser is not None:
         parser = replace(options.parser)
     else:
-        parser = cast("BeagsDataParserConfig", replace(config.data_config.dataparser, data=config.data_path))
-    check_data(parser.data, config_path)
+        parser = replace(config.data_config.dataparser, data=config.data_path)
+    check_data(parser.data, run.config_path)
     if options.masks is not None:
         if not options.masks.is_dir():
             raise UserError(f"the folder of masks {options.masks} does not exist: correct --masks-path.")
@@ -138,8 +137,7 @@ def data_to_reproject(scene: SavedScene, config_path: Path, options: Reprojectio
     data = replace(config.data_config, dataparser=parser, data=parser.data)
     if not options.run_size:
         parser.downscale_factor, data.camera_res_scale_factor = 1.0, 1.0
-    manager = data.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
-    return cast("BeagsDataManager", manager)
+    return RunData(data, "val")
 
 
 def write_reprojection(found: ReprojectedRun, output: Path, min_confidence: float = 0.0) -> list[str]:

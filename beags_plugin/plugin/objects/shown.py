@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 from beags_plugin.cleaning.silhouettes import MaskedViews
 from beags_plugin.core.exposure import Exposures
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, PREPARED, preparing_run
 from beags_plugin.plugin.runs.prepared import prepared_labels
-from beags_plugin.plugin.runs.read import SavedScene, data_of_run, raster_settings
+from beags_plugin.plugin.runs.run import Run
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
-from beags_plugin.plugin.views.datamanager import BeagsDataManager
+from beags_plugin.plugin.views.run_data import RunData
 from beags_plugin.plugin.views.views import View, unique_names
 from beags_plugin.preparation.consistent_masks import render_depths
-from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.filed_tensors import filed
 from beags_plugin.system.progress import progress_bar
@@ -38,7 +36,7 @@ class ShownScene:
 
     names: list[str]
     views: MaskedViews
-    manager: BeagsDataManager
+    manager: RunData
     chosen: range
     exposures: Exposures | None = None
 
@@ -49,22 +47,22 @@ class ShownScene:
         return [every[index] for index in self.chosen]
 
 
-def shown_scene(scene: SavedScene, config_path: Path) -> ShownScene:
+def shown_scene(run: Run) -> ShownScene:
     """Return what training views of a run show.
 
-    scene: read from ``config_path``. The depth of the whole scene is rendered once for each view, and kept on disk.
-    Raises ``Unshown`` for a run whose masks or data cannot be had.
+    The depth of the whole scene is rendered once for each view, and kept on disk. Raises ``Unshown`` for a run whose
+    masks or data cannot be had.
     """
-    run = config_path.parent
-    if (run / EXTRACTION_FILE).exists():
+    scene = run.scene
+    if (run.folder / EXTRACTION_FILE).exists():
         raise Unshown("the run is part of a scene, which does not show what hides it")
     if scene.picked:
         raise Unshown("its objects were picked in the viewer, and the masks that the run has kept are of others")
-    folder = preparing_run(run) / PREPARED
+    folder = preparing_run(run.folder) / PREPARED
     if not (folder / "grid.pt").exists():
         raise Unshown("the run has kept no masks")
     try:
-        manager = data_of_run(scene.config, config_path, split="val")
+        manager = run.views("val")
     except UserError as error:
         raise Unshown("the run's data cannot be read (--data names their folder)") from error
     dataset = manager.train_dataset
@@ -78,7 +76,7 @@ def shown_scene(scene: SavedScene, config_path: Path) -> ShownScene:
         )
     except UserError as error:
         raise Unshown("the masks that the run has kept do not fit its data") from error
-    rasterizer, settings = make_rasterizer(scene.config.model_config.rasterizer), raster_settings(scene)
+    rasterizer, settings = run.rasterizer, run.settings
     with progress_bar("Rendering depth", passing=True) as progress:
         surfels = scene.surfels().detach()
         depths = filed(render_depths(surfels, cameras, rasterizer, settings, "median", progress), surfels.means.device)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import torch
@@ -19,9 +18,7 @@ from beags_plugin.plugin.objects.export import Progress
 from beags_plugin.plugin.objects.extract import file_name, objects_with_gaussians
 from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
 from beags_plugin.plugin.runs.place import open_run
-from beags_plugin.plugin.runs.read import raster_settings, read_assigned_run
-from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
-from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.plugin.runs.run import Run
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.whole_files import write_whole
@@ -52,16 +49,17 @@ def write_underlays(
     the folder; ``renders/underlay`` of the run if None. progress: receives (done, total) pictures. data: if not where
     they were. Raises ``UserError`` for a mistake, before anything is written.
     """
-    scene = read_assigned_run(config_path, None if open_run(config_path).data_path.exists() else data)
+    run = Run(config_path, None if open_run(config_path).data_path.exists() else data)
+    scene = run.assigned
     present = objects_with_gaussians(scene, objects, config_path.parent)
     names = list(dict.fromkeys(objects)) or [name for name, class_id in present.items() if class_id != 0]
     if not names:
         raise UserError(f"{config_path} holds no object but the background: there is no silhouette to draw.")
-    manager = data_to_reproject(scene, config_path, ReprojectionOptions())
+    manager = data_to_reproject(run, ReprojectionOptions())
     folder = output or config_path.parent / "renders" / "underlay"
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder} is a file: name a folder with --output.")
-    rasterizer, settings = make_rasterizer(scene.config.model_config.rasterizer), raster_settings(scene)
+    rasterizer, settings = run.rasterizer, run.settings
     surfels = scene.surfels()
     parts = {name: select_class(surfels, scene.members, present[name])[0] for name in names}
     views, paths = manager.views("eval"), mask_paths(manager.eval_dataset.image_filenames)
@@ -79,7 +77,7 @@ def write_underlays(
             _save(folder / _folder_of(name) / path, as_photo)
             if progress is not None:
                 progress(index * len(parts) + number + 1, len(views) * len(parts))
-    parser = cast(BeagsDataParserConfig, manager.config.dataparser)
+    parser = manager.config.dataparser
     truth = Path(parser.data) / parser.ground_truth_path
     return Underlays(folder, len(views) * len(parts), truth / "silhouettes")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Annotated, Any, cast
@@ -18,7 +19,7 @@ from beags_plugin.plugin.options import rollback
 from beags_plugin.plugin.options.loss_spec import LossSpec
 from beags_plugin.plugin.options.machine import check_machine, default_device
 from beags_plugin.plugin.options.model_options import BeagsModelConfig
-from beags_plugin.plugin.options.run_format import RUN_FORMAT, other_format
+from beags_plugin.plugin.options.run_format import CONFIG_FILE, RUN_FORMAT, other_format
 from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.system.errors import UserError, print_user_errors_plainly, writing
@@ -28,9 +29,6 @@ from beags_plugin.system.output_option import OUTPUT_DIR
 from beags_plugin.system.pasted import quoted
 from beags_plugin.system.registry import load
 from beags_plugin.system.whole_files import write_text_atomically
-
-CONFIG_FILE = "config.yml"
-"""File of a run: its config."""
 
 
 def _adam_fuses_on_cpus() -> bool:
@@ -90,12 +88,11 @@ class BeagsTrainerConfig(TrainerConfig):
     """Version of the files of a run that is trained with this config."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Refuse a run of another format, and find a moved one, where nerfstudio's own loader reads config.yml."""
+        """Refuse a run of another format, where nerfstudio's own loader reads config.yml."""
         if state.get("run_format") != RUN_FORMAT:
             print_user_errors_plainly()
             raise other_format("this run", state.get("run_format"))
         self.__dict__.update(state)
-        load("beags_plugin.plugin.runs.place:place_for_nerfstudio")(self)
 
     @property
     def model_config(self) -> BeagsModelConfig:
@@ -175,6 +172,18 @@ class BeagsTrainerConfig(TrainerConfig):
         write_text_atomically(config_text(self), self.get_base_dir() / CONFIG_FILE)
         if self.machine.num_devices * self.machine.num_machines > 1:  # the training is in processes of its own
             run_lock(self.get_base_dir()).release()
+
+
+def _read_by_nerfstudio(loader: yaml.Loader, node: yaml.Node) -> Iterator[BeagsTrainerConfig]:
+    """Build a config that an ns-* command reads, in the place where its run lies now."""
+    config = BeagsTrainerConfig.__new__(BeagsTrainerConfig)
+    yield config
+    assert isinstance(node, yaml.MappingNode)
+    config.__setstate__(cast(dict[str, Any], loader.construct_mapping(node, deep=True)))
+    load("beags_plugin.plugin.runs.place:place_for_nerfstudio")(config)
+
+
+yaml.add_constructor(f"tag:yaml.org,2002:python/object:{__name__}.BeagsTrainerConfig", _read_by_nerfstudio, yaml.Loader)
 
 
 def base_config() -> BeagsTrainerConfig:

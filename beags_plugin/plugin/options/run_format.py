@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from beags_plugin.system.errors import UserError
 
+CONFIG_FILE = "config.yml"
+"""File of a run: its config."""
 RUN_FORMAT = 3
 """Written to config.yml; a run of another version is refused."""
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from beags_plugin.plugin.options.config import CONFIG_FILE
+from beags_plugin.plugin.options.run_format import CONFIG_FILE
 from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, REPORT_FILE
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.pasted import quoted
@@ -60,11 +60,11 @@ def resumed_config(run: Path, data: Path | None = None) -> BeagsTrainerConfig:
     """Return the config with which ``resume`` trains."""
     from beags_plugin.plugin.runs.checkpoint_file import read_checkpoint, scene_alone
     from beags_plugin.plugin.runs.layout import newest_checkpoint
-    from beags_plugin.plugin.runs.place import check_data, open_run
+    from beags_plugin.plugin.runs.place import check_data, open_for_training
 
     path = Path(run)
     path = path / CONFIG_FILE if path.is_dir() else path
-    config = open_run(path, data)
+    config = open_for_training(path, data)
     check_data(config.data_path, path)
     folder, models = config.get_base_dir(), config.get_checkpoint_dir()
     if not any(models.glob("step-*.ckpt")):

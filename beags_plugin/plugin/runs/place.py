@@ -4,25 +4,35 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beags_plugin.plugin.runs.layout import newest_checkpoint
-from beags_plugin.plugin.runs.run_config import load_run_config
+from beags_plugin.plugin.runs.run_config import RunConfig, load_run_config, read_run_config
 from beags_plugin.system.errors import UserError, print_user_errors_plainly
 from beags_plugin.system.progress import say
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.options.config import BeagsTrainerConfig
 
+_named: list[Path] = []  # config.yml files that Python code has said it reads
 _told: set[Path] = set()  # folders of moved runs that a line has named
 
 
-def open_run(config_path: Path, data: Path | None = None) -> BeagsTrainerConfig:
+def open_run(config_path: Path, data: Path | None = None) -> RunConfig:
     """Return the config of the run that lies beside its config.yml; raises ``UserError`` for another file.
 
     data: the photos, if not where the run was trained on them.
     """
+    config = read_run_config(config_path)
+    _place(config, config_path, data)
+    return config
+
+
+def open_for_training(config_path: Path, data: Path | None = None) -> BeagsTrainerConfig:
+    """Do as ``open_run``, for nerfstudio."""
     config = load_run_config(config_path)
     _place(config, config_path, data)
     return config
@@ -37,28 +47,46 @@ def check_data(data: Path, config_path: Path) -> None:
         )
 
 
-def place_for_nerfstudio(config: BeagsTrainerConfig) -> None:
-    """Place a config that ``eval_setup`` (of all ns-* commands) or ns-train reads from YAML; leave others alone.
+@contextmanager
+def named(config_path: Path) -> Iterator[None]:
+    """Say which config.yml nerfstudio's functions, such as ``eval_setup``, read in this block.
 
-    Both hand PyYAML a text, not a file, so that only their own variables know where it is from.
+    Its programs hand PyYAML a text, so that a run which was moved is found by the --load-config of the command line;
+    Python code that calls them has none.
     """
-    frame = sys._getframe(2)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("yaml"):
-        frame = frame.f_back
-    reader = (frame.f_globals.get("__name__"), frame.f_code.co_name)
-    if reader == ("nerfstudio.scripts.train", "main"):
-        flags = frame.f_locals["config"]
-        _place(config, flags.load_config, flags.data)
-        config.overwrite = getattr(flags, "overwrite", False)
-    elif reader == ("nerfstudio.utils.eval_utils", "eval_setup"):
-        path = Path(frame.f_locals["config_path"])
-        print_user_errors_plainly()
-        _place(config, path, None)
-        newest_checkpoint(config.get_checkpoint_dir())
-        check_data(config.data_path, path)
+    _named.append(config_path)
+    try:
+        yield
+    finally:
+        _named.pop()
 
 
-def _place(config: BeagsTrainerConfig, config_path: Path, data: Path | None) -> None:
+def place_for_nerfstudio(config: BeagsTrainerConfig) -> None:
+    """Place a config that an ns-* command reads from YAML where its --load-config says that the run lies."""
+    path = _named[-1] if _named else _option("--load-config")
+    if path is None:
+        return
+    if Path(sys.argv[0]).stem == "ns-train" and not _named:
+        _place(config, path, _option("--data"))
+        config.overwrite = "--overwrite" in sys.argv and _option("--overwrite") != Path("False")
+        return
+    print_user_errors_plainly()
+    _place(config, path, None)
+    newest_checkpoint(config.get_checkpoint_dir())
+    check_data(config.data_path, path)
+
+
+def _option(name: str) -> Path | None:
+    """Return the path that this program's command line gives an option, spelt with - or _; None where it does not."""
+    words = sys.argv[1:]
+    for index, word in enumerate(words):
+        option, equals, value = word.partition("=")
+        if option.replace("_", "-") == name and (equals or index + 1 < len(words)):
+            return Path(value if equals else words[index + 1])
+    return None
+
+
+def _place(config: RunConfig | BeagsTrainerConfig, config_path: Path, data: Path | None) -> None:
     folder, trained_in, recorded = config_path.absolute().parent, config.get_base_dir(), config.data_path
     config.run_dir = folder  # checkpoints, and all that is written
     found = recorded if data is None else data

@@ -16,6 +16,7 @@ from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.labels.classes import read_id_mask, read_mask
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED
+from beags_plugin.plugin.views.scene_data import SceneData
 from beags_plugin.plugin.views.views import unique_names
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.tensors import load_tensors
@@ -24,7 +25,7 @@ from beags_plugin.system.reading.text import load_json
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from beags_plugin.plugin.options.config import BeagsTrainerConfig
+    from beags_plugin.plugin.runs.run_config import RunConfig
 
 PREPARATION_REPORT = "report.json"
 _REMEDY = "restore it, or refine again from base/nerfstudio_models"
@@ -99,17 +100,14 @@ class TrainingMasks:
     confidence: Path
 
 
-def training_masks(config: BeagsTrainerConfig) -> list[TrainingMasks]:
+def training_masks(config: RunConfig) -> list[TrainingMasks]:
     """Read the masks of every training view of a run that refined; all as in their files, lens distortion included."""
-    parser = replace(config.data_config.dataparser, data=config.data_path)
-    outputs = parser.setup().get_dataparser_outputs("train")
+    outputs = SceneData(replace(config.data_config.dataparser, data=config.data_path)).split("train")
     metadata = outputs.metadata
-    exact = (metadata["ground_truth"] or {}).get("masks") or [None] * len(outputs.image_filenames)
+    exact = (metadata["ground_truth"] or {}).get("masks") or [None] * len(outputs.images)
     prepared = config.get_base_dir() / PREPARED
     views = []
-    for index, (name, photo) in enumerate(
-        zip(unique_names(outputs.image_filenames), outputs.image_filenames, strict=True)
-    ):
+    for index, (name, photo) in enumerate(zip(unique_names(outputs.images), outputs.images, strict=True)):
         used = read_id_mask(prepared / "masks" / f"{name}.png")
 
         def sized(path: Path | None, kind: str, like: np.ndarray = used) -> np.ndarray | None:

@@ -1,13 +1,11 @@
-"""Reading runs: the trained scene, the frame it was trained in, and the data it was trained on."""
+"""Reading parts of runs: the trained scene, and the frame it was trained in."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,18 +13,14 @@ from torch import Tensor
 from beags_plugin.core.exposure import Exposures
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export.base import Viewpoints
-from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.runs.checkpoint_file import exposures_of, model_state, read_checkpoint
 from beags_plugin.plugin.runs.layout import TRANSFORM_FILE, newest_checkpoint
 from beags_plugin.plugin.runs.picked import with_picked
-from beags_plugin.plugin.runs.place import check_data, open_run
-from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
-from beags_plugin.plugin.views.datamanager import BeagsDataManager
-from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.plugin.runs.place import open_run
+from beags_plugin.plugin.runs.run_config import RunConfig
+from beags_plugin.plugin.views.data_options import RunViewOptions
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.pasted import quoted
 from beags_plugin.system.reading.text import load_json, reason
 
 
@@ -37,7 +31,7 @@ class SavedScene:
     picked: whether the classes are those picked in the viewer, not those that the run trained.
     """
 
-    config: BeagsTrainerConfig
+    config: RunConfig
     state: dict[str, Any]
     step: int
     classes: dict[int, str]
@@ -65,14 +59,11 @@ class SavedScene:
         return exposures_of(self.state["_extra_state"])
 
 
-def read_run(config_path: Path, data: Path | None = None) -> SavedScene:
+def read_scene(config: RunConfig, config_path: Path) -> SavedScene:
     """Read a run's newest checkpoint, with what was picked in the viewer (``runs.picked``).
 
     Raises ``UserError`` if the run is incomplete or a file is damaged.
-
-    data: its data, if not where they were.
     """
-    config = open_run(config_path, data)
     path = newest_checkpoint(config.get_checkpoint_dir())
     checkpoint = read_checkpoint(path)
     trained = model_state(checkpoint, path)
@@ -80,15 +71,9 @@ def read_run(config_path: Path, data: Path | None = None) -> SavedScene:
     return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"], state is not trained)
 
 
-def read_assigned_run(config_path: Path, data: Path | None = None) -> SavedScene:
-    """Do as ``read_run``; raises ``UserError`` too if no class was assigned."""
-    scene = read_run(config_path, data)
-    if not scene.assigned:
-        raise UserError(
-            f"{config_path.parent} is a base without classes: refine it first "
-            f"(ns-train beags-refine --load-dir {quoted(scene.config.get_checkpoint_dir())})."
-        )
-    return scene
+def read_run(config_path: Path, data: Path | None = None) -> SavedScene:
+    """Open a run and read its scene alone; data: its data, if not where they were."""
+    return read_scene(open_run(config_path, data), config_path)
 
 
 def raster_settings(scene: SavedScene) -> RasterSettings:
@@ -117,38 +102,7 @@ def read_transform(run: Path) -> tuple[Tensor, float] | None:
     return transform, scale
 
 
-@contextmanager
-def _data(config: BeagsTrainerConfig, config_path: Path) -> Iterator[None]:
-    """Name the run in errors about its data, and refuse data that are gone."""
-    check_data(config.data_path, config_path)
-    try:
-        yield
-    except UserError as error:
-        raise UserError(f"the data of {config_path} cannot be read: {error}") from error
-
-
-def data_of_run(config: BeagsTrainerConfig, config_path: Path, split: Literal["val", "test"]) -> BeagsDataManager:
-    """Open the data that a run was trained on.
-
-    split: which held-out views to prepare. config_path: of the run, for messages. Raises ``UserError`` for data that
-    are gone or cannot be read.
-    """
-    with _data(config, config_path):
-        made = config.data_config.setup(device="cpu", test_mode=split, world_size=1, local_rank=0)
-        return cast(BeagsDataManager, made)
-
-
-def training_viewpoints(config: BeagsTrainerConfig, settings: RasterSettings, config_path: Path) -> Viewpoints:
-    """Return the training views of a run, in its own frame; raises ``UserError`` if its data cannot be read.
-
-    settings: depth range of the scene. config_path: of the run, for messages.
-    """
-    with _data(config, config_path):
-        # Poses alone: no photo is read, and lens distortion does not matter to where one looks from.
-        parser = replace(config.data_config.dataparser, data=config.data_path).setup()
-        cameras = parser.get_dataparser_outputs(split="train").cameras
-    return Viewpoints(
-        [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))],
-        make_rasterizer(config.model_config.rasterizer),
-        settings,
-    )
+def view_options(config: RunConfig) -> RunViewOptions:
+    """Return the options of a run's data, with the folder that counts."""
+    parser = replace(config.data_config.dataparser, data=config.data_path)
+    return replace(config.data_config, dataparser=parser, data=parser.data)

@@ -1,31 +1,38 @@
 """config.yml of a run, read without running code that somebody may have written into it.
 
 nerfstudio writes its configs as YAML with Python tags, and its loader calls whatever they name. Here a tag may only
-build dataclasses, enumerations and paths, and name classes, all of known packages.
+build dataclasses, enumerations and paths, and name classes, all of known packages. A finished run is read without
+nerfstudio: what it names of it becomes a ``Record``.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import pathlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from enum import Enum
 from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import yaml
 
 from beags_plugin.plugin.options.run_format import RUN_FORMAT, other_format
+from beags_plugin.plugin.options.scene_options import SceneOptions
+from beags_plugin.plugin.views.data_options import DataOptions, RunViewOptions
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import reason
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.options.config import BeagsTrainerConfig
 
+Config = TypeVar("Config")
 _PATHS = (pathlib.PurePath, pathlib.PosixPath, pathlib.WindowsPath, pathlib.Path, pathlib.PurePosixPath)
 _FUNCTIONS = {"nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate"}  # the only one in nerfstudio's configs
+_GONE = ("beags_plugin.plugin.options.pyramid.PyramidConfig",)  # options of runs that still open without them
 _GROUPS = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
 
 
@@ -57,7 +64,9 @@ class RunConfigLoader(yaml.UnsafeLoader):
         raise Refused(None, None, f"it names the module {name}", mark)
 
     def find_python_name(self, name: str, mark: Any, unsafe: bool = False) -> Any:
-        """Return the class that a tag names."""
+        """Return the class that a tag names; a ``Record`` for options that are gone."""
+        if name in _GONE:
+            return Record
         module, _, attribute = name.rpartition(".")
         known = _package(module) in known_packages() or f"{module}.".startswith("torch.optim.")
         if not known and name not in {f"pathlib.{kind.__name__}" for kind in _PATHS}:
@@ -102,12 +111,126 @@ class RunConfigLoader(yaml.UnsafeLoader):
         instance.__dict__.update(state)
 
 
+@dataclass
+class Record:
+    """Options of nerfstudio's own, as attributes."""
+
+
+@dataclass
+class RunConfig:
+    """The config of a finished run, as far as commands need it; without nerfstudio.
+
+    pipeline: has the options of the scene, ``model``, and of the data, ``datamanager``. source: the nodes of the YAML,
+    with all that this class leaves out.
+    """
+
+    pipeline: Any = field(default_factory=Record)
+    run_dir: Path | None = None
+    output_dir: Path = Path("outputs")
+    experiment_name: str | None = None
+    method_name: str = ""
+    timestamp: str = ""
+    relative_model_dir: Path = Path("nerfstudio_models")
+    run_format: int = 0
+    source: yaml.Node | None = None
+
+    @property
+    def model_config(self) -> SceneOptions:
+        """Options of the scene."""
+        return self.pipeline.model
+
+    @property
+    def data_config(self) -> RunViewOptions:
+        """Options of the views."""
+        return self.pipeline.datamanager
+
+    @property
+    def data_path(self) -> Path:
+        """The folder (or transforms .json) that the run is trained on: --data, or the data parser's own."""
+        return Path(self.data_config.data or self.data_config.dataparser.data)
+
+    def get_base_dir(self) -> Path:
+        """Return the folder of the run."""
+        if self.run_dir is not None:
+            return self.run_dir
+        return Path(f"{self.output_dir}/{self.experiment_name or 'unnamed'}/{self.method_name}/{self.timestamp}")
+
+    def get_checkpoint_dir(self) -> Path:
+        """Return the folder of its checkpoints."""
+        return self.get_base_dir() / self.relative_model_dir
+
+
+_PLAIN: Mapping[str, type] = {
+    "beags_plugin.plugin.options.config.BeagsTrainerConfig": RunConfig,
+    "beags_plugin.plugin.options.config.FusedAdamConfig": Record,
+    "beags_plugin.plugin.options.model_options.BeagsModelConfig": SceneOptions,
+    "beags_plugin.plugin.views.datamanager.BeagsDataManagerConfig": RunViewOptions,
+    "beags_plugin.plugin.views.dataparser.BeagsDataParserConfig": DataOptions,
+}
+"""Classes of configs that import nerfstudio, and those that hold the same options without it."""
+
+
+class FinishedRunLoader(RunConfigLoader):
+    """``RunConfigLoader`` that imports no package but this one, and of this one nothing that needs nerfstudio."""
+
+    def find_python_name(self, name: str, mark: Any, unsafe: bool = False) -> Any:
+        """Return the class that stands for the one that a tag names."""
+        if (plain := _PLAIN.get(name)) is not None:
+            return plain
+        package = _package(name)
+        if package in known_packages() - {"beags_plugin"} or name.startswith("torch.optim."):
+            return Record
+        return super().find_python_name(name, mark, unsafe)
+
+    def make_python_instance(
+        self, suffix: str, node: Any, args: Any = None, kwds: Any = None, newobj: bool = False, unsafe: bool = False
+    ) -> Any:
+        """Build as ``RunConfigLoader`` does; a ``Record`` for what is not ours, such as nerfstudio's enumerations."""
+        kind = self.find_python_name(suffix, node.start_mark)
+        return Record() if kind is Record else super().make_python_instance(suffix, node, args, kwds, newobj, unsafe)
+
+
+def _only_named(loader: FinishedRunLoader, suffix: str, node: yaml.Node) -> str:
+    """Return a name, such as that of a config's target, as it is: it is not looked up."""
+    if _package(suffix) not in known_packages() and not suffix.startswith("torch.optim."):
+        loader.find_python_name(suffix, node.start_mark)  # refuses it
+    return suffix
+
+
+FinishedRunLoader.add_multi_constructor("tag:yaml.org,2002:python/name:", _only_named)
+
+
+def read_run_config(path: Path) -> RunConfig:
+    """Read the config of a finished run without nerfstudio; raises ``UserError`` as ``load_run_config`` does."""
+
+    def both(text: str) -> RunConfig:
+        loader = FinishedRunLoader(text)
+        try:
+            node = loader.get_single_node()
+            config = loader.construct_document(node)
+        finally:
+            loader.dispose()
+        if isinstance(config, RunConfig):
+            config.source = yaml.compose(text)
+        return config
+
+    return _loaded(path, both, RunConfig)
+
+
 def load_run_config(path: Path) -> BeagsTrainerConfig:
-    """Read the config of a run without executing code; raises ``UserError`` for any other file, or an older run's."""
+    """Read the config of a run, for nerfstudio, without executing code.
+
+    Raises ``UserError`` for any other file, or an older run's.
+    """
     from beags_plugin.plugin.options.config import BeagsTrainerConfig
 
+    loader = RunConfigLoader
+    return _loaded(path, lambda text: yaml.load(text, Loader=loader), BeagsTrainerConfig)  # noqa: S506  (it refuses)
+
+
+def _loaded(path: Path, load: Callable[[str], Any], kind: type[Config]) -> Config:
     try:
-        config = yaml.load(path.read_text("utf8"), Loader=RunConfigLoader)  # noqa: S506  (it refuses what is not known)
+        config = load(path.read_text("utf8"))
     except OSError as error:
         raise UserError(f"{path} cannot be read ({reason(error)}): name the config.yml of a run.") from error
     except Refused as error:
@@ -116,11 +239,25 @@ def load_run_config(path: Path) -> BeagsTrainerConfig:
         raise other_format(path) from None
     except (yaml.YAMLError, ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
         raise UserError(f"{path} is no YAML of a run ({_reason(error)}): restore it, or name another run.") from error
-    if not isinstance(config, BeagsTrainerConfig):
+    if not isinstance(config, kind):
         raise UserError(f"{path} is not a run of ns-train beags: name the config.yml of one.")
     if (found := vars(config).get("run_format")) != RUN_FORMAT:
         raise other_format(path, found)
     return config
+
+
+def with_values(node: yaml.Node, values: Mapping[str, Path | int | None]) -> None:
+    """Set entries of a config's nodes in place, by dotted names."""
+    for name, value in values.items():
+        *parents, last = name.split(".")
+        holder = node
+        for each in parents:
+            holder = next(child for key, child in holder.value if key.value == each)
+        new = yaml.compose(yaml.dump(str(value) if isinstance(value, Path) else value))
+        if isinstance(value, Path):
+            tag = f"tag:yaml.org,2002:python/object/apply:pathlib.{type(value).__name__}"
+            new = yaml.SequenceNode(tag, [new], flow_style=True)
+        holder.value = [(key, new if key.value == last else child) for key, child in holder.value]
 
 
 def _reason(error: Exception) -> str:

@@ -17,7 +17,8 @@ from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.base import Loss
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.options.model_options import BeagsModelConfig, fixed_background
+from beags_plugin.plugin.options.model_options import BeagsModelConfig
+from beags_plugin.plugin.options.scene_options import fixed_background
 from beags_plugin.plugin.runs.checkpoint_file import exposures_of, extra_state
 from beags_plugin.plugin.training.timing import StepClock
 from beags_plugin.preparation.own_training import OwnTraining

@@ -1,21 +1,70 @@
-"""nerfstudio's cameras: checked, joined, resized with fixed pixel centres, and converted to the method's."""
+"""Cameras of many views, in nerfstudio's terms: checked, resized with fixed pixel centres, made the method's own."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
 
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera, viewmat_from_opengl
 from beags_plugin.system.errors import UserError
 
+if TYPE_CHECKING:
+    from nerfstudio.cameras.cameras import Cameras
 
-def camera_from_nerfstudio(cameras: Cameras, index: int = 0) -> Camera:
-    """Return the method's camera for one of nerfstudio's (any batch shape, ``index`` into the flattened batch).
+    AnyCameras: TypeAlias = "SceneCameras | Cameras"
+
+PERSPECTIVE, FISHEYE = 1, 2  # nerfstudio's numbers of the two lenses that can be undistorted
+CAMERA_TYPES = {
+    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), PERSPECTIVE),
+    "OPENCV_FISHEYE": FISHEYE, "EQUIRECTANGULAR": 3, "OMNIDIRECTIONALSTEREO_L": 4, "OMNIDIRECTIONALSTEREO_R": 5,
+    "VR180_L": 6, "VR180_R": 7, "ORTHOPHOTO": 8, "FISHEYE624": 9,
+}  # fmt: skip
+"""nerfstudio's number of each camera model that transforms.json may name."""
+
+
+@dataclass
+class SceneCameras:
+    """V cameras with the fields of nerfstudio's ``Cameras``, for commands that do not import it.
+
+    camera_to_worlds: [V, 3, 4] float32, OpenGL axes. fx, fy, cx, cy: [V, 1] float32, pixels. width, height: [V, 1]
+    int64. distortion_params: [V, 6] float32, k1 k2 k3 k4 p1 p2. camera_type: [V, 1] int64.
+    """
+
+    camera_to_worlds: Tensor
+    fx: Tensor
+    fy: Tensor
+    cx: Tensor
+    cy: Tensor
+    width: Tensor
+    height: Tensor
+    distortion_params: Tensor
+    camera_type: Tensor
+
+    def __len__(self) -> int:
+        return len(self.camera_to_worlds)
+
+    def chosen(self, index: Tensor) -> SceneCameras:
+        """Return copies of the cameras ``index`` [M] int64."""
+        parts = {each.name: getattr(self, each.name) for each in fields(self)}
+        return SceneCameras(**{name: part[index] for name, part in parts.items()})
+
+
+def intrinsics(cameras: AnyCameras, index: int) -> Tensor:
+    """Return K [3, 3] float32 of one camera of a flat batch."""
+    K = torch.eye(3)
+    K[0, 0], K[1, 1] = cameras.fx[index, 0], cameras.fy[index, 0]
+    K[0, 2], K[1, 2] = cameras.cx[index, 0], cameras.cy[index, 0]
+    return K
+
+
+def camera_from_nerfstudio(cameras: AnyCameras, index: int = 0) -> Camera:
+    """Return the method's camera for one of many (any batch shape, ``index`` into the flattened batch).
 
     Float32, on the device of ``cameras``, differentiable in the pose; without lens distortion.
     """
@@ -27,7 +76,7 @@ def camera_from_nerfstudio(cameras: Cameras, index: int = 0) -> Camera:
     return Camera(viewmat_from_opengl(pose), K, width, height)
 
 
-def resize_cameras(cameras: Cameras, widths: Tensor, heights: Tensor) -> None:
+def resize_cameras(cameras: AnyCameras, widths: Tensor, heights: Tensor) -> None:
     """Set the cameras' sizes to ``widths`` x ``heights`` ([N, 1] integer pixels) in place and scale K to match.
 
     An image resized from W to W' pixels maps x to x W' / W in coordinates whose pixel centres are at + 0.5, so focal
@@ -54,16 +103,15 @@ def downscaled_size(sizes: Tensor, factor: float) -> Tensor:
     return torch.floor(sizes / factor + 0.5).clamp(min=1).to(torch.int64)
 
 
-def check_cameras(cameras: Cameras, images: Sequence[Path]) -> None:
+def check_cameras(cameras: SceneCameras, images: Sequence[Path]) -> None:
     """Raise ``UserError`` for a lens that cannot be undistorted and for a pose that is no rotation and translation."""
-    supported = (CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value)
     rotations = cameras.camera_to_worlds[:, :3, :3].double()
     # Poses are float32 and often printed with 6 digits; a mirrored or scaled one misses by 1 or more.
     error = (rotations @ rotations.transpose(1, 2) - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2))
     rigid = (error < 1e-2) & (torch.linalg.det(rotations) > 0) & cameras.camera_to_worlds.isfinite().all(2).all(1)
     for i, path in enumerate(images):
-        if int(cameras.camera_type[i]) not in supported:
-            kind = CameraType(int(cameras.camera_type[i])).name
+        if (number := int(cameras.camera_type[i])) not in (PERSPECTIVE, FISHEYE):
+            kind = next(name for name, other in CAMERA_TYPES.items() if other == number)
             raise UserError(f"the camera of {path} is of type {kind}: undistort the images to a pinhole camera first.")
         if not rigid[i]:
             raise UserError(f"the pose of {path} is not a rotation and a translation: correct its pose.")
@@ -75,9 +123,8 @@ def check_cameras(cameras: Cameras, images: Sequence[Path]) -> None:
             )
         if min(int(cameras.width[i]), int(cameras.height[i])) < 1:
             raise UserError(f"the camera of {path} has no pixels: correct its width and height.")
-    fisheye = cameras.camera_type[:, 0] == CameraType.FISHEYE.value
+    fisheye = cameras.camera_type[:, 0] == FISHEYE
     parameters = cameras.distortion_params
-    assert parameters is not None  # both of nerfstudio's parsers give them, zeros for no distortion
     if not bool(parameters.isfinite().all()):
         index = int((~parameters.isfinite()).any(1).nonzero()[0])
         raise UserError(f"the lens distortion of {images[index]} is no number: correct the poses.")

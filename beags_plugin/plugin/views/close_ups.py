@@ -17,9 +17,9 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera, cropped
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE, resize_nearest
 from beags_plugin.labels.label_maps import CompressedMap, to_int32
-from beags_plugin.plugin.views.dataset import resize_area
 from beags_plugin.plugin.views.photo_files import Box, PhotoFiles
 from beags_plugin.plugin.views.small_views import small_camera
+from beags_plugin.plugin.views.split_photos import resize_area
 from beags_plugin.plugin.views.views import View
 
 DETAIL = 4.0

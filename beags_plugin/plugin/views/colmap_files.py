@@ -8,16 +8,33 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from nerfstudio.process_data.colmap_utils import parse_colmap_camera_params
 from torch import Tensor
 
 from beags_plugin.data.frame_cameras import LENS, FrameCamera
 from beags_plugin.data.photo_files import plain_name, without_suffix
-from beags_plugin.plugin.views.colmap_model import lines_of, model_files, read, read_cameras, read_images
+from beags_plugin.plugin.views.colmap_model import (
+    ColmapCamera,
+    lines_of,
+    model_files,
+    read,
+    read_cameras,
+    read_images,
+)
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.colors import GREY, as_bytes
 from beags_plugin.system.reading.text import number_of
 
+_LENSES = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+}
+"""COLMAP's camera models that are known here, with their parameters in order."""
 _POINT = struct.Struct("<QdddBBBdQ")  # id, position, colour, error, length of the track
 
 
@@ -30,33 +47,40 @@ def read_lens(file: Path, size: Sequence[int], focal: float) -> Tensor:
     cameras = read_cameras(file)
     if len(cameras) != 1:
         return torch.zeros(6)
-    try:
-        camera = parse_colmap_camera_params(next(iter(cameras.values())))
-    except (NotImplementedError, IndexError):
+    found = _frame_camera(next(iter(cameras.values())))
+    if found is None or found.model != "OPENCV":
         return torch.zeros(6)
-    same = (camera["w"], camera["h"]) == tuple(size) and abs(camera["fl_x"] - focal) < 1e-3 * focal
-    if not same or camera["camera_model"] != "OPENCV":
-        return torch.zeros(6)
-    return torch.tensor([float(camera.get(name, 0.0)) for name in LENS])
+    same = (found.width, found.height) == tuple(size) and abs(found.fx - focal) < 1e-3 * focal
+    return torch.tensor(found.lens) if same else torch.zeros(6)
 
 
 def colmap_cameras(file: Path) -> dict[int, FrameCamera]:
     """Read the cameras of a model by id; raises ``UserError`` for a lens that no camera here has."""
     found = {}
     for index, camera in read_cameras(file).items():
-        try:
-            entries = parse_colmap_camera_params(camera)
-        except NotImplementedError as error:
+        if camera.model not in _LENSES:
             raise UserError(
                 f"the camera {index} of {file} has COLMAP's lens {camera.model}, which is not known here: undistort "
                 "the images with colmap image_undistorter and give that folder."
-            ) from error
-        except IndexError as error:
-            raise UserError(f"the camera {index} of {file} lacks parameters: export the model again.") from error
-        fx, fy, cx, cy = (float(entries[name]) for name in ("fl_x", "fl_y", "cx", "cy"))
-        lens = tuple(float(entries.get(name, 0.0)) for name in LENS)
-        found[index] = FrameCamera(fx, fy, cx, cy, entries["w"], entries["h"], lens, entries["camera_model"])
+            )
+        if (entry := _frame_camera(camera)) is None:
+            raise UserError(f"the camera {index} of {file} lacks parameters: export the model again.")
+        found[index] = entry
     return found
+
+
+def _frame_camera(camera: ColmapCamera) -> FrameCamera | None:
+    """Return a camera of a model as frames have it; None for a lens that is not known, or too few parameters."""
+    names = _LENSES.get(camera.model)
+    if names is None or len(camera.params) < len(names):
+        return None
+    values = dict(zip(names, map(float, camera.params), strict=False))
+    fx = values.get("f", values.get("fx", 0.0))
+    kind = "OPENCV_FISHEYE" if camera.model.endswith("FISHEYE") else "OPENCV"
+    lens = tuple(values.get(name, 0.0) for name in LENS)
+    return FrameCamera(
+        fx, values.get("fy", fx), values["cx"], values["cy"], camera.width, camera.height, lens, kind
+    )  # fmt: skip
 
 
 def read_colmap_points(file: Path) -> tuple[np.ndarray, np.ndarray]:

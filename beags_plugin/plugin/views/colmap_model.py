@@ -10,10 +10,9 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
-from nerfstudio.data.utils import colmap_parsing_utils as colmap
 
 from beags_plugin.data.files import IMAGE_SUFFIXES
 from beags_plugin.system.errors import UserError
@@ -24,6 +23,24 @@ Found = TypeVar("Found")
 _IMAGE = struct.Struct("<i7di")  # id, rotation wxyz, translation, id of the camera; a name and its features follow
 _FEATURE = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _NAMED = re.compile(rf"^\d+(?:\s+\S+){{7}}\s+\d+\s+\S.*({'|'.join(map(re.escape, IMAGE_SUFFIXES))})$", re.IGNORECASE)
+
+
+_CAMERA = struct.Struct("<iiQQ")  # id, number of the model, width and height; the parameters follow as doubles
+_PARAMETERS = {
+    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
+}  # fmt: skip
+"""COLMAP's camera models in the order of their numbers, with how many parameters each has."""
+
+
+@dataclass(frozen=True)
+class ColmapCamera:
+    """A camera of a model: the name of COLMAP's camera model, pixels, and that model's parameters [P] float64."""
+
+    model: str
+    width: int
+    height: int
+    params: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -47,9 +64,9 @@ def model_files(folder: Path) -> tuple[Path, Path]:
     return folder / f"cameras.{end}", folder / f"images.{end}"
 
 
-def read_cameras(file: Path) -> dict[int, Any]:
-    """Read cameras.bin or cameras.txt: nerfstudio's ``Camera`` by id; raises ``UserError``."""
-    return read(_cameras_text if file.suffix == ".txt" else colmap.read_cameras_binary, file)
+def read_cameras(file: Path) -> dict[int, ColmapCamera]:
+    """Read cameras.bin or cameras.txt, by id; raises ``UserError``."""
+    return read(_cameras_text if file.suffix == ".txt" else _cameras_binary, file)
 
 
 def read_images(file: Path) -> list[ColmapImage]:
@@ -85,12 +102,39 @@ def lines_of(file: Path) -> Iterator[str]:
     return (line for line in lines if not line.lstrip().startswith("#"))
 
 
-def _cameras_text(file: Path) -> dict[int, Any]:
+def rotation_of(quaternion: np.ndarray) -> np.ndarray:
+    """Return the rotation [3, 3] of a quaternion wxyz [4]."""
+    w, x, y, z = quaternion
+    return np.array(
+        [
+            [1 - 2 * y**2 - 2 * z**2, 2 * x * y - 2 * w * z, 2 * z * x + 2 * w * y],
+            [2 * x * y + 2 * w * z, 1 - 2 * x**2 - 2 * z**2, 2 * y * z - 2 * w * x],
+            [2 * z * x - 2 * w * y, 2 * y * z + 2 * w * x, 1 - 2 * x**2 - 2 * y**2],
+        ]
+    )
+
+
+def _cameras_binary(file: Path) -> dict[int, ColmapCamera]:
+    content, at = file.read_bytes(), 8
+    (count,) = struct.unpack_from("<Q", content)
+    names, cameras = list(_PARAMETERS), {}
+    for _ in range(count):
+        camera_id, number, width, height = _CAMERA.unpack_from(content, at)
+        if not 0 <= number < len(names):
+            raise KeyError(number)
+        params = struct.unpack_from(f"<{_PARAMETERS[names[number]]}d", content, at + _CAMERA.size)
+        at += _CAMERA.size + 8 * len(params)
+        cameras[camera_id] = ColmapCamera(names[number], width, height, np.array(params))
+    assert len(cameras) == count
+    return cameras
+
+
+def _cameras_text(file: Path) -> dict[int, ColmapCamera]:
     cameras = {}
     for line in lines_of(file):
         if words := line.split():
             params = np.array([float(word) for word in words[4:]])
-            cameras[int(words[0])] = colmap.Camera(int(words[0]), words[1], int(words[2]), int(words[3]), params)
+            cameras[int(words[0])] = ColmapCamera(words[1], int(words[2]), int(words[3]), params)
     return cameras
 
 

@@ -17,19 +17,20 @@ from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from rich.progress import track
 from torch import Tensor
-from tyro.conf import Suppress
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.labels.label_maps import CompressedMap, to_compact, to_int32
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio, take_intrinsics
 from beags_plugin.plugin.views.close_ups import CloseUps
-from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig, absolute
+from beags_plugin.plugin.views.data_options import ViewOptions
+from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.plugin.views.dense_seeds import MOST_PHOTOS, with_dense_seeds
 from beags_plugin.plugin.views.focus import aim_by, focused
 from beags_plugin.plugin.views.objects_alone import objects_alone
 from beags_plugin.plugin.views.photo_files import PhotoFiles
+from beags_plugin.plugin.views.run_data import Split
 from beags_plugin.plugin.views.streaming import Lazy, StreamedViews
 from beags_plugin.plugin.views.views import View, unique_names
 from beags_plugin.system import processes
@@ -38,33 +39,14 @@ from beags_plugin.system.progress import say
 
 READ_AHEAD = 8  # streamed images that are read before their use
 OWN_KEYS = ("labels", "alpha")
-Split = Literal["train", "eval"]
 
 
 @dataclass
-class BeagsDataManagerConfig(FullImageDatamanagerConfig):
+class BeagsDataManagerConfig(ViewOptions, FullImageDatamanagerConfig):
     """Options of the data manager."""
 
     _target: type = field(default_factory=lambda: BeagsDataManager)
     dataparser: AnnotatedDataParserUnion = field(default_factory=BeagsDataParserConfig)
-    stream: Literal["auto", "always", "never"] = "auto"
-    """Whether images are read from disk when needed instead of being kept in memory, with the same results; auto: if
-    those of a split would take more than stream_above_gb."""
-    stream_above_gb: Suppress[float] = 0.5
-    """GB (10^9 bytes) that the images of a split may take in memory before they are streamed."""
-    dense_seeds: Literal["auto", "on", "off"] = "auto"
-    """Whether a base begins with more seed points, on whose depth several photos agree; auto: where there are at most
-    50 photos, of which features give few points. It takes one or two seconds a photo."""
-    begins: Suppress[bool] = False  # whether a base is to begin with seed points, which the pipeline says
-    focus: str = "off"
-    """Share of the steps that see close-ups of objects, at up to the size of the photos' files, and not whole photos.
-    off: none; auto: half, where masks cover less than 40 % of the photos' pixels and photos are scaled down."""
-    photos: Literal["all", "objects"] = "all"
-    """What training sees of the photos: all, or objects, their pixels alone before a random colour (turntables)."""
-
-    def __setattr__(self, name: str, value: object) -> None:
-        """Keep ``data`` absolute, so that a saved config.yml works from any folder."""
-        super().__setattr__(name, absolute(value) if name == "data" else value)
 
 
 class BeagsDataManager(FullImageDatamanager[BeagsDataset]):

@@ -1,91 +1,26 @@
-"""Images and labels at the size of the cameras."""
+"""Images and labels at the size of the cameras, for nerfstudio."""
 
 from __future__ import annotations
 
-from functools import partial
-from pathlib import Path
-
-import cv2
-import numpy as np
-import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
-from PIL import Image
 
-from beags_plugin.labels.class_ids import IGNORE, resize_nearest
-from beags_plugin.labels.classes import read_mask
-from beags_plugin.plugin.views.cameras import downscaled_size, resize_cameras
-from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.images import read_image
+from beags_plugin.plugin.views.split_photos import SplitPhotos
 
 
-class BeagsDataset(InputDataset):
-    """Views of one split: ``image`` [H, W, 3] and ``labels`` [H, W] uint16, all IGNORE where a view has no mask.
-
-    Images with alpha are put on black. Images are averaged over the area of each new pixel, labels take the id at its
-    centre; both cover the camera's image from edge to edge.
+class BeagsDataset(SplitPhotos, InputDataset):
+    """Views of one split, as ``SplitPhotos`` reads them: ``image`` [H, W, 3] and ``labels`` [H, W] uint16.
 
     scale_factor: of the data manager's ``camera_res_scale_factor``, on top of the parser's downscale factor.
     """
 
+    cameras: Cameras
     exclude_batch_keys_from_device = ["image", "mask", "labels", "alpha"]
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
-        super().__init__(dataparser_outputs)  # not the factor: nerfstudio rounds the size down but scales K exactly
+        # without the factor, as nerfstudio rounds the size down but scales K exactly
+        InputDataset.__init__(self, dataparser_outputs)
         if scale_factor != 1.0:
             self.scale_factor = scale_factor
-            width, height = (
-                downscaled_size(side, 1.0 / scale_factor) for side in (self.cameras.width, self.cameras.height)
-            )
-            resize_cameras(self.cameras, width, height)
-        # The data manager crops the cameras when it undistorts; the files keep this size.
-        self.file_sizes = torch.cat([self.cameras.width, self.cameras.height], 1).tolist()
-
-    def get_numpy_image(self, image_idx: int, path: Path | None = None) -> np.ndarray:
-        """Read the image [H, W, 3] uint8, sRGB, before undistortion; path: of another picture of the same view."""
-        path = path or self._dataparser_outputs.image_filenames[image_idx]
-        return resize_area(read_image(path, partial(_colors, path)), *self.file_sizes[image_idx])
-
-    def get_alpha(self, image_idx: int) -> np.ndarray | None:
-        """Read the image's alpha [H, W] uint8, before undistortion; None if it is opaque everywhere."""
-        alpha = read_image(self._dataparser_outputs.image_filenames[image_idx], _alpha)
-        return None if alpha is None else resize_area(alpha, *self.file_sizes[image_idx])
-
-    def get_full_image(self, image_idx: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Read image and alpha as the other two do, at the size of the file, which is decoded once."""
-        path = self._dataparser_outputs.image_filenames[image_idx]
-        return read_image(path, lambda image: (_colors(path, image), _alpha(image)))
-
-    def get_metadata(self, data: dict) -> dict:
-        """Read the labels of view ``data["image_idx"]``, before undistortion."""
-        index = data["image_idx"]
-        return {"labels": torch.from_numpy(self.get_labels(index, *self.file_sizes[index]))}
-
-    def get_labels(self, image_idx: int, width: int, height: int) -> np.ndarray:
-        """Read the labels [height, width] uint16 of a view, before undistortion."""
-        path = self.metadata["mask_filenames"][image_idx]
-        if path is None:
-            return np.full((height, width), IGNORE, np.uint16)
-        ids = read_mask(path, self.metadata["mask_kind"], self.metadata["ignore_ids"])
-        return resize_nearest(ids, height, width)
-
-
-def _colors(path: Path, image: Image.Image) -> np.ndarray:
-    if image.mode.startswith(("I", "F")):
-        raise UserError(f"the image {path} has more than 8 bits per channel: convert it to 8 bits.")
-    if image.has_transparency_data:
-        image = image.convert("RGBA")
-        image = Image.alpha_composite(Image.new("RGBA", image.size, (0, 0, 0, 255)), image)
-    return np.array(image.convert("RGB"))
-
-
-def _alpha(image: Image.Image) -> np.ndarray | None:
-    alpha = np.array(image.convert("RGBA").getchannel("A")) if image.has_transparency_data else None
-    return None if alpha is None or (alpha == 255).all() else alpha
-
-
-def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Average an image [H, W, C] or [H, W] over the area of each of the ``width`` x ``height`` new pixels."""
-    if image.shape[:2] == (height, width):
-        return image
-    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        self.set_sizes(scale_factor)

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.plugin.views.dataset import resize_area
 from beags_plugin.plugin.views.small_views import small_camera
+from beags_plugin.plugin.views.split_photos import resize_area
 from beags_plugin.plugin.views.views import View, in_unit_range
 from beags_plugin.posing.dense_points import dense_points
 from beags_plugin.posing.plane_sweep import PosedPhoto

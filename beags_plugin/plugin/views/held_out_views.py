@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, overload
+from typing import TYPE_CHECKING, Literal, overload
 
 import numpy as np
 import torch
@@ -17,9 +17,12 @@ from beags_plugin.evaluation.records import EvalView, FullPhoto
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 from beags_plugin.labels.classes import read_mask, read_object_mask
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
-from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.plugin.views.photo_files import Box
+from beags_plugin.plugin.views.run_data import RunData
 from beags_plugin.system.errors import UserError
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.views.datamanager import BeagsDataManager
 
 _NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={}, removed={}, removed_shown={})
 
@@ -36,7 +39,7 @@ class HeldOutViews(Sequence[EvalView]):
     photograph.
     """
 
-    def __init__(self, manager: BeagsDataManager, classes: Mapping[int, str], background: Tensor) -> None:
+    def __init__(self, manager: RunData | BeagsDataManager, classes: Mapping[int, str], background: Tensor) -> None:
         """Open the views. classes: id to name. background: [3], behind photographs with alpha, as in training."""
         self.manager = manager
         self.classes = classes

@@ -2,28 +2,37 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import cv2
 import numpy as np
-from nerfstudio.cameras.cameras import Cameras, CameraType
-from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
 
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+from beags_plugin.plugin.views.cameras import FISHEYE, camera_from_nerfstudio, intrinsics
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.views.cameras import AnyCameras
 
 _MARGIN = 0.5  # of the image on each side: farther out, a lens model may fold back into the image
 
 
-def has_lens(cameras: Cameras, index: int) -> bool:
+def has_lens(cameras: AnyCameras, index: int) -> bool:
     """Return whether a view has lens distortion."""
     return cameras.distortion_params is not None and bool(cameras.distortion_params[index].any())
 
 
-def undistort_image(image: np.ndarray, distorted: Cameras, index: int) -> np.ndarray:
+def undistort_image(image: np.ndarray, distorted: AnyCameras, index: int) -> np.ndarray:
     """Remove the lens distortion from an image [H, W, C] and crop it, as nerfstudio does; for a view with a lens."""
-    return _by_nerfstudio(image, distorted, index)[1]
+    K, lens, new_K, (x, y, width, height) = _straightened(distorted, index, (image.shape[1], image.shape[0]))
+    if int(distorted.camera_type[index]) == FISHEYE:
+        maps = cv2.fisheye.initUndistortRectifyMap(
+            K, lens, np.eye(3), new_K, (image.shape[1], image.shape[0]), cv2.CV_32FC1
+        )
+        return cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR)
+    return cv2.undistort(image, K, lens, None, new_K)[y : y + height, x : x + width]
 
 
-def straighten(cameras: Cameras) -> None:
+def straighten(cameras: AnyCameras) -> None:
     """Give cameras the K and size that their images have once undistorted, in place; no image is read for it."""
     known: dict[tuple, tuple] = {}  # most scenes have one camera for all views
     for index in range(len(cameras)):
@@ -33,16 +42,17 @@ def straighten(cameras: Cameras) -> None:
         assert cameras.distortion_params is not None
         key = (*(float(part[index]) for part in parts), *cameras.distortion_params[index].tolist())
         if key not in known:
-            blank = np.zeros((int(cameras.height[index]), int(cameras.width[index]), 3), np.uint8)
-            K, image = _by_nerfstudio(blank, cameras, index)
-            known[key] = (K, image.shape[:2])
-        K, (height, width) = known[key]
+            size = int(cameras.width[index]), int(cameras.height[index])
+            _, _, K, (x, y, width, height) = _straightened(cameras, index, size)
+            K[0, 2], K[1, 2] = K[0, 2] - x + 0.5, K[1, 2] - y + 0.5
+            known[key] = (K, (width, height))
+        K, (width, height) = known[key]
         cameras.fx[index], cameras.fy[index] = float(K[0, 0]), float(K[1, 1])
         cameras.cx[index], cameras.cy[index] = float(K[0, 2]), float(K[1, 2])
         cameras.width[index], cameras.height[index] = width, height
 
 
-def undistort_labels(labels: np.ndarray, distorted: Cameras, straight: Cameras, index: int) -> np.ndarray:
+def undistort_labels(labels: np.ndarray, distorted: AnyCameras, straight: AnyCameras, index: int) -> np.ndarray:
     """Remove the lens distortion from labels; the nearest id is taken, as ids never blend.
 
     labels: [h, w], the whole distorted image at any size. distorted, straight: the cameras before and after
@@ -52,13 +62,13 @@ def undistort_labels(labels: np.ndarray, distorted: Cameras, straight: Cameras, 
     return labels if maps is None else _nearest(labels, *maps, IGNORE)
 
 
-def undistort_alpha(alpha: np.ndarray, distorted: Cameras, straight: Cameras, index: int) -> np.ndarray:
+def undistort_alpha(alpha: np.ndarray, distorted: AnyCameras, straight: AnyCameras, index: int) -> np.ndarray:
     """Remove the lens distortion from an alpha channel [h, w] uint8, interpolated; 0 outside the lens."""
     maps = _lens_maps(distorted, straight, index, alpha.shape)
     return alpha if maps is None else cv2.remap(alpha, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
 
-def straight_size(distorted: Cameras, straight: Cameras, index: int, shape: tuple[int, ...]) -> tuple[int, int]:
+def straight_size(distorted: AnyCameras, straight: AnyCameras, index: int, shape: tuple[int, ...]) -> tuple[int, int]:
     """Return width and height of the straight image at the scale at which the distorted one is of ``shape`` [h, w]."""
     height, width = shape
     return (
@@ -68,7 +78,7 @@ def straight_size(distorted: Cameras, straight: Cameras, index: int, shape: tupl
 
 
 def undistort_region(
-    image: np.ndarray, distorted: Cameras, straight: Cameras, index: int, box: tuple[int, int, int, int],
+    image: np.ndarray, distorted: AnyCameras, straight: AnyCameras, index: int, box: tuple[int, int, int, int],
     interpolation: int, border: int,
 ) -> np.ndarray:  # fmt: skip
     """Return a region of a straight image, of which memory does not grow with the rest.
@@ -85,7 +95,12 @@ def undistort_region(
 
 
 def redistort_labels(
-    labels: np.ndarray, distorted: Cameras, straight: Cameras, index: int, shape: tuple[int, int], border: int
+    labels: np.ndarray,
+    distorted: AnyCameras,
+    straight: AnyCameras,
+    index: int,
+    shape: tuple[int, int],
+    border: int,
 ) -> np.ndarray:
     """Put the lens distortion back into labels: the inverse of ``undistort_labels``.
 
@@ -103,7 +118,7 @@ def redistort_labels(
     return _nearest(labels, maps[..., 0], maps[..., 1], border)
 
 
-def project_through_lens(points: np.ndarray, cameras: Cameras, index: int) -> tuple[np.ndarray, np.ndarray]:
+def project_through_lens(points: np.ndarray, cameras: AnyCameras, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Return pixels [P, 2] (centres at + 0.5) and depths [P] of world points [P, 3] float64 in a distorted view.
 
     cameras: before ``straighten``. A point that is not near the image has the depth 0.
@@ -127,17 +142,30 @@ def project_through_lens(points: np.ndarray, cameras: Cameras, index: int) -> tu
     return xy, z
 
 
-def _by_nerfstudio(image: np.ndarray, distorted: Cameras, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the K [3, 3] and the image [H', W', C] that nerfstudio's undistortion gives."""
-    camera = distorted[index].reshape(())
-    assert camera.distortion_params is not None
-    K = camera.get_intrinsics_matrices().numpy()
-    K, image, _ = _undistort_image(camera, camera.distortion_params.numpy(), {}, image, K)
-    return K, image
+def _straightened(
+    distorted: AnyCameras, index: int, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, int, int, int]]:
+    """Return how nerfstudio's ``_undistort_image`` removes the lens of an image of width and height ``size``.
+
+    That is, for OpenCV, whose pixel centres are whole numbers: K [3, 3], the lens's coefficients, the new K [3, 3],
+    and left, top, width and height of what it keeps of the new image. All in its own precision, so that bits agree.
+    """
+    assert distorted.distortion_params is not None
+    k1, k2, k3, k4, p1, p2 = distorted.distortion_params[index].numpy()
+    K = intrinsics(distorted, index).numpy()
+    K[0, 2], K[1, 2] = K[0, 2] - 0.5, K[1, 2] - 0.5
+    if int(distorted.camera_type[index]) == FISHEYE:
+        lens = np.array([k1, k2, k3, k4])
+        new_K = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, lens, size, np.eye(3), balance=0)
+        return K, lens, new_K, (0, 0, *size)
+    lens = np.array([k1, k2, p1, p2, k3, k4, 0, 0])
+    new_K, kept = cv2.getOptimalNewCameraMatrix(K, lens, size, 0)
+    x, y, width, height = kept
+    return K, lens, new_K, (x, y, width, height)
 
 
 def _lens_maps(
-    distorted: Cameras, straight: Cameras, index: int, shape: tuple[int, ...]
+    distorted: AnyCameras, straight: AnyCameras, index: int, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return x and y [h', w'] float32 of each straight pixel in the distorted image of ``shape`` [h, w]; None
     without distortion."""
@@ -148,7 +176,11 @@ def _lens_maps(
 
 
 def _maps_of_region(
-    distorted: Cameras, straight: Cameras, index: int, shape: tuple[int, ...], box: tuple[int, int, int, int]
+    distorted: AnyCameras,
+    straight: AnyCameras,
+    index: int,
+    shape: tuple[int, ...],
+    box: tuple[int, int, int, int],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ``_lens_maps`` within left, top, right and bottom of the straight image at the scale of ``shape``."""
     height, width = shape
@@ -161,17 +193,17 @@ def _maps_of_region(
     return make(K, lens, np.eye(3), new_K, (right - left, bottom - top), cv2.CV_32FC1)
 
 
-def _opencv_lens(cameras: Cameras, index: int) -> tuple[bool, np.ndarray]:
+def _opencv_lens(cameras: AnyCameras, index: int) -> tuple[bool, np.ndarray]:
     """Return whether a view has a fisheye lens, and its coefficients float64 in OpenCV's order."""
     assert cameras.distortion_params is not None
     k1, k2, k3, k4, p1, p2 = cameras.distortion_params[index].double().numpy()
-    fisheye = int(cameras.camera_type[index]) == CameraType.FISHEYE.value
+    fisheye = int(cameras.camera_type[index]) == FISHEYE
     return fisheye, np.array([k1, k2, k3, k4] if fisheye else [k1, k2, p1, p2, k3])
 
 
-def _intrinsics(cameras: Cameras, index: int, width: int, height: int) -> np.ndarray:
+def _intrinsics(cameras: AnyCameras, index: int, width: int, height: int) -> np.ndarray:
     """Return K [3, 3] float64 of the view's image at this size, for OpenCV, whose pixel centres are whole numbers."""
-    K = cameras.get_intrinsics_matrices()[index].double().numpy()
+    K = intrinsics(cameras, index).double().numpy()
     K = np.diag([width / int(cameras.width[index]), height / int(cameras.height[index]), 1.0]) @ K
     K[:2, 2] -= 0.5
     return K
@@ -181,7 +213,7 @@ def _nearest(labels: np.ndarray, x: np.ndarray, y: np.ndarray, border: int) -> n
     return cv2.remap(labels, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(border,))
 
 
-def straight_points(points: np.ndarray, distorted: Cameras, straight: Cameras, index: int) -> np.ndarray:
+def straight_points(points: np.ndarray, distorted: AnyCameras, straight: AnyCameras, index: int) -> np.ndarray:
     """Return where pixels [P, 2] (centres at + 0.5) of a distorted view are in the straight one, [P, 2] float64."""
     if not has_lens(distorted, index) or len(points) == 0:
         return points
@@ -190,7 +222,7 @@ def straight_points(points: np.ndarray, distorted: Cameras, straight: Cameras, i
     return _straight(points - 0.5, distorted, index, K, new_K) + 0.5
 
 
-def _straight(pixels: np.ndarray, distorted: Cameras, index: int, K: np.ndarray, new_K: np.ndarray) -> np.ndarray:
+def _straight(pixels: np.ndarray, distorted: AnyCameras, index: int, K: np.ndarray, new_K: np.ndarray) -> np.ndarray:
     """Return where pixels [P, 2] (centres at whole numbers) of a view with a lens are in the straight one of new_K."""
     fisheye, lens = _opencv_lens(distorted, index)
     pixels = np.ascontiguousarray(pixels.reshape(-1, 1, 2))

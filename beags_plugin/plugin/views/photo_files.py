@@ -18,8 +18,8 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import to_compact
 from beags_plugin.plugin.views import lens
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
-from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.plugin.views.small_views import small_camera
+from beags_plugin.plugin.views.split_photos import SplitPhotos
 
 Box = tuple[int, int, int, int]
 """Left, top, right and bottom of a region, pixels of a whole photo at its file's size, without lens; right and bottom
@@ -32,7 +32,7 @@ class PhotoFiles:
     cameras: after that. Every picture that is returned shows what these cameras show.
     """
 
-    def __init__(self, dataset: BeagsDataset) -> None:
+    def __init__(self, dataset: SplitPhotos) -> None:
         self.dataset = dataset
         self._distorted = deepcopy(dataset.cameras)
         lens.straighten(dataset.cameras)
@@ -40,22 +40,29 @@ class PhotoFiles:
 
     def load(self, index: int, image_type: Literal["uint8", "float32"]) -> dict[str, Any]:
         """Read image, labels and alpha of a view from its files at the size that is trained on."""
-        cameras = (self._distorted, self.cameras, index)
-        data = self.dataset.get_data(index, image_type=image_type)
-        if lens.has_lens(self._distorted, index):
-            data["image"] = torch.from_numpy(lens.undistort_image(data["image"].numpy(), self._distorted, index))
-        labels = lens.undistort_labels(data["labels"].numpy(), *cameras)
+        data = self.photo(index, image_type)
+        labels = self.undistorted(self.dataset.get_labels(index, *self.dataset.file_sizes[index]), index)
         assert labels.shape == data["image"].shape[:2], "labels and image differ in size"
-        data["labels"] = to_compact(torch.from_numpy(labels.astype(np.int32)))
+        return {"image_idx": index, **data, "labels": to_compact(torch.from_numpy(labels.astype(np.int32)))}
+
+    def photo(self, index: int, image_type: Literal["uint8", "float32"]) -> dict[str, Any]:
+        """Read ``image`` and, if there is any, ``alpha`` of a view as ``load`` does."""
+        image = self.dataset.get_numpy_image(index)
+        if image_type == "float32":
+            image = image.astype(np.float32) / np.float32(255.0)
+        if lens.has_lens(self._distorted, index):
+            image = lens.undistort_image(image, self._distorted, index)
+        data = {"image": torch.from_numpy(image)}
         if (alpha := self.dataset.get_alpha(index)) is not None:
-            data["alpha"] = torch.from_numpy(lens.undistort_alpha(alpha, *cameras))
+            straight = lens.undistort_alpha(alpha, self._distorted, self.cameras, index)
+            data["alpha"] = torch.from_numpy(straight)
         return data
 
     def mask_labels(self, index: int) -> np.ndarray | None:
         """Read the labels [H, W] uint16 in the mask file of a view; None without a file."""
         if self.dataset.metadata["mask_filenames"][index] is None:
             return None
-        return self.undistorted(self.dataset.get_metadata({"image_idx": index})["labels"].numpy(), index)
+        return self.undistorted(self.dataset.get_labels(index, *self.dataset.file_sizes[index]), index)
 
     def undistorted(self, labels: np.ndarray, index: int) -> np.ndarray:
         """Remove a view's lens distortion from labels [h, w] of any size."""

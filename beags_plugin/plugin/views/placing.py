@@ -8,10 +8,9 @@ from typing import Literal
 
 import numpy as np
 import torch
-from nerfstudio.cameras import camera_utils
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs, transform_poses_to_original_space
 from torch import Tensor
 
+from beags_plugin.plugin.views.orientation import oriented
 from beags_plugin.system.errors import UserError
 
 FAR = 16.0
@@ -54,20 +53,6 @@ class Placing:
         return (scale * (torch.from_numpy(points).double() @ transform[:, :3].T + transform[:, 3])).float()
 
 
-class PlacedOutputs(DataparserOutputs):
-    """nerfstudio's outputs with a ``dataparser_transform`` [3, 4] in double precision, by which cameras go back too."""
-
-    def transform_poses_to_original_space(
-        self, poses: Tensor, camera_convention: Literal["opengl", "opencv"] = "opencv"
-    ) -> Tensor:
-        transform = self.dataparser_transform.to(poses.device)
-        back = transform_poses_to_original_space(
-            poses.double(), transform.double(), self.dataparser_scale, camera_convention=camera_convention
-        )
-        exact = float(back[..., 3].abs().max()) * 2.0**-24 * self.dataparser_scale < 1e-5 if len(back) else True
-        return back.to(poses.dtype) if exact else back
-
-
 def place(
     camera_to_world: np.ndarray,
     normalization: Normalization,
@@ -93,11 +78,8 @@ def place(
     near = given.clone()
     near[:, :3, 3] -= origin
     try:
-        poses, transform = camera_utils.auto_orient_and_center_poses(
-            near.float(),
-            method=orientation or normalization.orientation_method,  # type: ignore[arg-type]
-            center_method=normalization.center_method,
-        )
+        method = orientation or normalization.orientation_method
+        poses, transform = oriented(near.float(), method, normalization.center_method)
     except ValueError as error:
         raise UserError(
             f"{file} asks for the orientation {orientation!r}, which is none of pca, up, vertical and none: correct "

@@ -1,7 +1,4 @@
-"""The poses of all views as their source has them: transforms.json, a COLMAP model, or a layout's own table.
-
-Nothing here may import a data manager: nerfstudio loads this module while it is importing its own.
-"""
+"""The poses of all views as their source has them: transforms.json, a COLMAP model, or a layout's own table."""
 
 from __future__ import annotations
 
@@ -10,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from nerfstudio.data.utils.colmap_parsing_utils import qvec2rotmat
 
 from beags_plugin.data.dataset import ColmapModel, PoseTable, TransformsFile
 from beags_plugin.data.files import image_size, list_images
@@ -18,7 +14,7 @@ from beags_plugin.data.frame_cameras import FrameCamera, frame_camera
 from beags_plugin.data.photo_files import PhotoFinder, plain_name, without_suffix
 from beags_plugin.data.transforms_file import read_transforms
 from beags_plugin.plugin.views.colmap_files import colmap_cameras, read_lens
-from beags_plugin.plugin.views.colmap_model import model_files, read_images
+from beags_plugin.plugin.views.colmap_model import model_files, read_images, rotation_of
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
 from beags_plugin.system.reading.text import read_text, reason
@@ -123,7 +119,7 @@ def _of_colmap(poses: ColmapModel, root: Path) -> SourceViews:
         if not (length > 0 and np.isfinite(image.translation).all()):
             raise UserError(f"{images_file} gives {image.name} no pose that is a number: export the model again.")
         world_to_camera = np.eye(4)
-        world_to_camera[:3] = np.c_[qvec2rotmat(image.quaternion / length), image.translation]
+        world_to_camera[:3] = np.c_[rotation_of(image.quaternion / length), image.translation]
         matrix[:] = np.linalg.inv(world_to_camera)[:3] * [1.0, -1.0, -1.0, 1.0]
     matrices = _COLMAP_APPLIED[:, :3] @ matrices
     members = {

@@ -1,7 +1,4 @@
-"""Poses of all views of a scene in nerfstudio's normalised world, from the source that the layout names.
-
-Nothing here may import a data manager: nerfstudio loads this module while it is importing its own.
-"""
+"""Poses of all views of a scene in nerfstudio's normalised world, from the source that the layout names."""
 
 from __future__ import annotations
 
@@ -10,14 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import torch
-from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, Cameras
-from nerfstudio.data.scene_box import SceneBox
 from torch import Tensor
 
 from beags_plugin.data.dataset import Poses
 from beags_plugin.data.files import photo_names
 from beags_plugin.data.frame_cameras import FrameCamera
 from beags_plugin.data.photo_files import missing_note, without_suffix
+from beags_plugin.plugin.views.cameras import CAMERA_TYPES, SceneCameras
 from beags_plugin.plugin.views.placing import Normalization, Placing, far_note, place
 from beags_plugin.plugin.views.pose_sources import read_source
 from beags_plugin.system.errors import UserError
@@ -34,10 +30,9 @@ class PosedViews:
 
     images: list[Path]
     stems: list[set[str]]
-    cameras: Cameras
+    cameras: SceneCameras
     members: dict[str, list[int]] | None
     placing: Placing
-    scene_box: SceneBox
     points: Path | None = None
     notes: tuple[str, ...] = ()
 
@@ -72,24 +67,22 @@ def read_poses(poses: Poses, root: Path, normalization: Normalization, strict: b
         }
     named = [PurePosixPath(without_suffix(source.names[index])).name for index in there]
     stems = [{name, image.stem, whole} for name, image, whole in zip(named, images, photo_names(images), strict=True)]
-    side = normalization.scene_scale
-    box = SceneBox(aabb=torch.tensor([[-side] * 3, [side] * 3]))
     return PosedViews(
-        images, stems, cameras, members, placing, box, source.points, tuple(note for note in notes if note is not None)
+        images, stems, cameras, members, placing, source.points, tuple(note for note in notes if note is not None)
     )
 
 
-def _cameras(file: Path, given: Sequence[FrameCamera], poses: Tensor, images: Sequence[Path]) -> Cameras:
-    """Return nerfstudio's cameras; poses: [V, 3, 4] float32. Raises ``UserError`` for an unknown kind of camera."""
+def _cameras(file: Path, given: Sequence[FrameCamera], poses: Tensor, images: Sequence[Path]) -> SceneCameras:
+    """Return the cameras; poses: [V, 3, 4] float32. Raises ``UserError`` for an unknown kind of camera."""
     for camera, image in zip(given, images, strict=True):
-        if camera.model not in CAMERA_MODEL_TO_TYPE:
+        if camera.model not in CAMERA_TYPES:
             raise UserError(
                 f"the camera of {image} in {file} is of the model {camera.model!r}, which is unknown: name OPENCV or "
                 "OPENCV_FISHEYE, or undistort the photos."
             )
     K = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in given], dtype=torch.float64).float()
     sizes = torch.tensor([[camera.width, camera.height] for camera in given])
-    return Cameras(
+    return SceneCameras(
         camera_to_worlds=poses,
         fx=K[:, 0:1],
         fy=K[:, 1:2],
@@ -98,5 +91,5 @@ def _cameras(file: Path, given: Sequence[FrameCamera], poses: Tensor, images: Se
         width=sizes[:, :1],
         height=sizes[:, 1:],
         distortion_params=torch.tensor([camera.lens for camera in given]),
-        camera_type=torch.tensor([CAMERA_MODEL_TO_TYPE[camera.model].value for camera in given])[:, None],
+        camera_type=torch.tensor([CAMERA_TYPES[camera.model] for camera in given])[:, None],
     )

@@ -28,6 +28,7 @@ from beags_plugin.extraction.ply import read_ply
 from beags_plugin.extraction.select import select_class
 from beags_plugin.plugin.objects import export
 from beags_plugin.plugin.objects.export import export_run
+from beags_plugin.plugin.objects.exported import ExportedFile
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.system.reading.ply import read_vertices
 
@@ -144,7 +145,8 @@ def test_all_writes_every_object_the_background_and_a_manifest(trained, tmp_path
     folder = tmp_path / "out"
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["run"] == str(trained) and (manifest["frame"], manifest["world"]) == ("object", "input")
-    assert [(one["name"], one["class_id"]) for one in manifest["objects"]] == [(n, i) for i, n in CLASSES.items()]
+    named = [(one["name"], one["class_id"]) for one in manifest["objects"]]
+    assert named == [("cup", 1), ("box", 2), ("background", 0)]
     files = {file["path"] for one in manifest["objects"] for file in one["files"]}
     assert files == {path.name for path in folder.iterdir()} - {"manifest.json"} and len(files) == 6
     surfels, ids = discs()
@@ -160,6 +162,23 @@ def test_all_writes_every_object_the_background_and_a_manifest(trained, tmp_path
             assert np.allclose((there @ np.array(one["to_run"]).T)[:, :3], expected, atol=1e-5)
 
 
+def test_quick_formats_come_before_slow_ones_and_all_of_an_object_before_the_next(trained, tmp_path, monkeypatch):
+    from beags_plugin.export.mesh import GlbExporter
+    from beags_plugin.export.spz import SpzExporter
+    from beags_plugin.plugin.objects.export_job import ExportJob
+
+    order: list[str] = []
+
+    def write(job, label, exporter, path, item, class_id):
+        order.append(path.name)
+        return ExportedFile(label, None, {}, "only listed")
+
+    assert GlbExporter.needs_views and not SpzExporter.needs_views
+    monkeypatch.setattr(ExportJob, "_write", write)
+    main(["export", "--load-config", str(trained), "--all", "--format", "glb", "spz", "--output", str(tmp_path)])
+    assert order == [f"{name}.{kind}" for name in ("cup", "box", "background") for kind in ("spz", "glb")]
+
+
 def test_meshes_of_a_run_lie_where_its_discs_are(trained, tmp_path, monkeypatch):
     """In the input's frame, from the run's own views; the manifest tells what was left out, and why."""
     trimesh = pytest.importorskip("trimesh")
@@ -169,7 +188,12 @@ def test_meshes_of_a_run_lie_where_its_discs_are(trained, tmp_path, monkeypatch)
     surfels, ids = discs()
     place = world_frame(trained)
     manifest = json.loads((tmp_path / "manifest.json").read_text())
-    for one in manifest["objects"]:
+    *objects, background = manifest["objects"]
+    assert background["name"] == "background" and not background["files"]
+    assert "name it, with --object" in background["left_out"][0]["reason"]
+    main([*arguments, str(tmp_path), "--object", "background"])
+    assert (tmp_path / "background.glb").exists()
+    for one in objects:
         (file,) = one["files"]
         vertices = trimesh.load_mesh(tmp_path / file["path"], process=False).vertices
         assert len(vertices) == file["vertices"] > 100
@@ -186,7 +210,8 @@ def test_meshes_of_a_run_lie_where_its_discs_are(trained, tmp_path, monkeypatch)
     main([*arguments, str(tmp_path / "none"), "--all"])
     manifest = json.loads((tmp_path / "none/manifest.json").read_text())
     assert [path.name for path in (tmp_path / "none").iterdir()] == ["manifest.json"]
-    assert all("is seen in 3 training views" in one["left_out"][0]["reason"] for one in manifest["objects"])
+    told = [one["left_out"][0]["reason"] for one in manifest["objects"]]
+    assert all("is seen in 3 training views" in reason for reason in told[:-1]) and len(told) == 3
     with pytest.raises(SystemExit):  # named alone it is a mistake
         main([*arguments, str(tmp_path / "none"), "--object", "cup"])
 

@@ -74,12 +74,12 @@ def test_pixels_of_photos_give_the_scale(tmp_path):
     config = write_trained(tmp_path / "run", root)
     from beags_plugin.core.lifting import lift
     from beags_plugin.plugin.objects.evaluate import EvaluatedRun
-    from beags_plugin.plugin.runs.read import raster_settings, training_viewpoints
+    from beags_plugin.plugin.runs.run import Run
     from beags_plugin.rasterizers.rendering import geometry_inputs
 
     scene = read_run(config)
     run = EvaluatedRun(config)
-    views = training_viewpoints(scene.config, raster_settings(scene), config)
+    views = Run(config).viewpoints
     names = [path.stem for path in run.views.manager.train_dataset.image_filenames]
     places = []
     for view in (0, 2):

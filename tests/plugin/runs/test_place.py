@@ -18,7 +18,7 @@ from run_folders import write_prepared, write_scene, write_trained
 
 from beags_plugin.plugin.objects.extract import extract_objects
 from beags_plugin.plugin.runs.layout import preparing_run
-from beags_plugin.plugin.runs.place import open_run
+from beags_plugin.plugin.runs.place import named, open_run
 from beags_plugin.system.errors import UserError
 
 
@@ -94,13 +94,14 @@ def test_data_elsewhere_are_named_by_an_option(tmp_path):
 # -- nerfstudio's commands -------------------------------------------------------------------------------------------
 
 
-def test_commands_of_nerfstudio_read_and_write_where_the_run_lies(moved, tmp_path, capsys):
+def test_commands_of_nerfstudio_read_and_write_where_the_run_lies(moved, tmp_path, capsys, monkeypatch):
     from nerfstudio.scripts.eval import ComputePSNR
     from nerfstudio.scripts.exporter import ExportGaussianSplat
     from nerfstudio.scripts.render import DatasetRender
     from nerfstudio.utils.eval_utils import eval_setup
 
     before = files(tmp_path / "old")
+    monkeypatch.setattr("sys.argv", ["ns-viewer", "--load-config", str(moved / "config.yml")])
     config, pipeline, checkpoint, _ = eval_setup(moved / "config.yml")  # all that ns-viewer takes from it
     assert config.get_base_dir() == moved and checkpoint.parent.parent == moved
     assert pipeline.datamanager.get_datapath() == tmp_path / "new/lab"
@@ -108,8 +109,10 @@ def test_commands_of_nerfstudio_read_and_write_where_the_run_lies(moved, tmp_pat
     ComputePSNR(moved / "config.yml", tmp_path / "psnr.json").main()
     assert json.loads((tmp_path / "psnr.json").read_text())["checkpoint"] == str(checkpoint)
     cup = moved / "extracted/cup"
+    monkeypatch.setattr("sys.argv", ["ns-export", "gaussian-splat", f"--load_config={cup / 'config.yml'}"])
     ExportGaussianSplat(cup / "config.yml", tmp_path / "exported").main()
-    DatasetRender(load_config=cup / "config.yml", output_path=tmp_path / "pictures").main()
+    with named(cup / "config.yml"):  # as Python code says it
+        DatasetRender(load_config=cup / "config.yml", output_path=tmp_path / "pictures").main()
     assert (tmp_path / "exported/splat.ply").exists() and any((tmp_path / "pictures").rglob("*.jpg"))
     assert files(tmp_path / "old") == before
 
@@ -118,10 +121,11 @@ def test_commands_of_nerfstudio_refuse_a_copy_that_is_not_whole(moved, tmp_path)
     from nerfstudio.utils.eval_utils import eval_setup
 
     (tmp_path / "new/lab").rename(tmp_path / "new/photos")
-    with pytest.raises(UserError, match=f"data of .*run/config.yml are not at {tmp_path}/old/lab: .* look at {moved}/"):
+    told = f"data of .*run/config.yml are not at {tmp_path}/old/lab: .* look at {moved}/"
+    with named(moved / "config.yml"), pytest.raises(UserError, match=told):
         eval_setup(moved / "config.yml")
     shutil.rmtree(moved / "nerfstudio_models")
-    with pytest.raises(UserError, match=f"{moved}/nerfstudio_models holds no checkpoint"):
+    with named(moved / "config.yml"), pytest.raises(UserError, match=f"{moved}/nerfstudio_models holds no checkpoint"):
         eval_setup(moved / "config.yml")
 
 

@@ -38,6 +38,7 @@ from beags_plugin.plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.presets import preset_config
 from beags_plugin.plugin.runs.picked import write_picked
 from beags_plugin.plugin.runs.read import read_run
+from beags_plugin.plugin.runs.run import Run
 from beags_plugin.plugin.training.exposure import GAMMA, RATES, PhotoExposures, exposures_of_run, photo_gains
 from beags_plugin.plugin.views.datamanager import BeagsDataManager, BeagsDataManagerConfig
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
@@ -318,7 +319,7 @@ def test_the_base_extracted_and_picked_runs_keep_them(whole, tmp_path):
 
 def test_textures_and_exports_get_photos_of_the_mean_exposure(whole):
     scene = read_run(whole / "config.yml")
-    shown = shown_scene(scene, whole / "config.yml")
+    shown = shown_scene(Run(whole / "config.yml"))
     for view, name in enumerate(shown.names):
         (affine,) = (
             own for own, known in zip(scene.exposures.affine, scene.exposures.names, strict=True) if known == name
@@ -332,7 +333,7 @@ def test_textures_and_exports_get_photos_of_the_mean_exposure(whole):
 def test_burnt_out_pixels_are_no_colours_of_a_surface(whole):
     """Evened, the white of a bright photo would be a grey that no surface has."""
     scene = read_run(whole / "config.yml")
-    shown = shown_scene(scene, whole / "config.yml")
+    shown = shown_scene(Run(whole / "config.yml"))
     images = [view.image.clone() for view in shown.photos]
     images[2][5:9, 3:6] = 1.0
     burnt = [(image == 1.0).all(dim=2) for image in images]

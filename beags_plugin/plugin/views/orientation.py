@@ -1,0 +1,93 @@
+"""nerfstudio's normalisation of poses, step by step: bits of training depend on it.
+
+Its ``auto_orient_and_center_poses`` does the same; a test compares them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def oriented(poses: Tensor, method: str, center_method: str) -> tuple[Tensor, Tensor]:
+    """Turn and centre poses [V, 4, 4] float32; return them [V, 3, 4], and the transform [3, 4] that did it.
+
+    method: pca, up, vertical or none. center_method: poses, focus or none. Raises ``ValueError`` for another.
+    """
+    origins = poses[:, :3, 3]
+    middle = torch.mean(origins, dim=0)
+    if center_method not in ("poses", "focus", "none"):
+        raise ValueError(f"unknown center_method {center_method!r}")
+    center = {"poses": lambda: middle, "focus": lambda: _focus(poses, middle), "none": lambda: torch.zeros(3)}
+    translation = center[center_method]()
+    if method == "none":
+        transform = torch.eye(4)
+        transform[:3, 3] = -translation
+        transform = transform[:3, :]
+        return transform @ poses, transform
+    if method == "pca":
+        return _by_principal_axes(poses, origins - middle, translation)
+    if method not in ("up", "vertical"):
+        raise ValueError(f"unknown method {method!r}")
+    rotation = _rotation_between(_up(poses, vertical=method == "vertical"), torch.tensor([0.0, 0.0, 1.0]))
+    transform = torch.cat([rotation, rotation @ -translation[..., None]], dim=-1)
+    return transform @ poses, transform
+
+
+def _by_principal_axes(poses: Tensor, from_middle: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
+    _, axes = torch.linalg.eigh(from_middle.T @ from_middle)
+    axes = torch.flip(axes, dims=(-1,))
+    if torch.linalg.det(axes) < 0:
+        axes[:, 2] = -axes[:, 2]
+    transform = torch.cat([axes, axes @ -translation[..., None]], dim=-1)
+    turned = transform @ poses
+    if turned.mean(dim=0)[2, 1] < 0:
+        turned[1:3, :] = -1 * turned[1:3, :]
+        transform[1:3, :] = -1 * transform[1:3, :]
+    return turned, transform
+
+
+def _up(poses: Tensor, vertical: bool) -> Tensor:
+    """Return the mean up of the cameras [3]; vertical: the direction that projects closest to their y axes."""
+    up = torch.mean(poses[:, :3, 1], dim=0)
+    up = up / torch.linalg.norm(up)
+    if not vertical:
+        return up
+    # min ||X u|| for ||u|| = 1, X the cameras' x axes: the last right singular vector, unless the second smallest
+    # singular value says that the x axes lie on a line: then the mean up without its part along that line.
+    _, values, axes = torch.linalg.svd(poses[:, :3, 0], full_matrices=False)
+    if values[1] > 0.17 * math.sqrt(poses.shape[0]):
+        return axes[2, :] if torch.dot(axes[2, :], up) > 0 else -axes[2, :]
+    up = up - axes[0, :] * torch.dot(up, axes[0, :])
+    return up / torch.linalg.norm(up)
+
+
+def _rotation_between(first: Tensor, second: Tensor) -> Tensor:
+    """Return the rotation [3, 3] that turns one direction [3] to another, by Rodrigues' formula."""
+    first, second = first / torch.linalg.norm(first), second / torch.linalg.norm(second)
+    axis = torch.linalg.cross(first, second)
+    if torch.sum(torch.abs(axis)) < 1e-6:  # parallel: any axis across does
+        other = torch.tensor([1.0, 0.0, 0.0]) if abs(first[0]) < 1e-6 else torch.tensor([0.0, 1.0, 0.0])
+        axis = torch.linalg.cross(first, other)
+    axis = axis / torch.linalg.norm(axis)
+    cross = torch.tensor([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    angle = torch.acos(torch.clip(torch.dot(first, second), -1, 1))
+    return torch.eye(3) + torch.sin(angle) * cross + (1 - torch.cos(angle)) * (cross @ cross)
+
+
+def _focus(poses: Tensor, middle: Tensor) -> Tensor:
+    """Return the point [3] closest to the optical axes of the cameras that have it in front of them."""
+    directions, origins = -poses[:, :3, 2:3], poses[:, :3, 3:4]
+    focus = middle
+    active = torch.sum(directions.squeeze(-1) * (focus - origins.squeeze(-1)), dim=-1) > 0
+    while torch.sum(active.int()) > 1:
+        directions, origins = directions[active], origins[active]
+        across = torch.eye(3) - directions * torch.transpose(directions, -2, -1)
+        squared = torch.transpose(across, -2, -1) @ across
+        focus = torch.linalg.inv(squared.mean(0)) @ (squared @ origins).mean(0)[:, 0]
+        active = torch.sum(directions.squeeze(-1) * (focus - origins.squeeze(-1)), dim=-1) > 0
+        if active.all():
+            break
+    return focus
