@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from beags_plugin.export.fusion import Mesh
+from beags_plugin.system.open3d_kernels import open3d_kernels
 
 GAP = 2  # texels between charts; what is between them is filled with the colours of the nearest
 SMALLEST = 128  # side of a picture that is as large as it needs to be
@@ -76,7 +77,7 @@ def unwrapped(mesh: Mesh, size: int, density: float = 0.0) -> Atlas:
 
 def texels(atlas: Atlas) -> Texels:
     """Return the texels of the charts, row by row."""
-    import open3d
+    open3d = open3d_kernels()
 
     scene, tensor = open3d.t.geometry.RaycastingScene(), open3d.core.Tensor
     flat = np.concatenate([atlas.size * atlas.uv, np.zeros((len(atlas.uv), 1))], axis=1)

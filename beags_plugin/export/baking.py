@@ -16,6 +16,7 @@ from beags_plugin.export.base import Photo
 from beags_plugin.export.color import linear_from_srgb, srgb_from_linear
 from beags_plugin.export.fusion import Mesh
 from beags_plugin.export.surface import in_voxels, surface_of
+from beags_plugin.system.open3d_kernels import open3d_kernels
 
 _OFF = 1.0  # voxels above the surface, where rays to the camera start
 FLATTEST = 0.2  # least cosine between normal and ray: flatter views smear
@@ -101,7 +102,7 @@ def well_inside(mask: Tensor) -> np.ndarray:
 
 def _hidden(caster: Any, mesh: Mesh, places: Places, center: np.ndarray) -> np.ndarray:
     """Return [P] bool, whether the mesh stands between places and the camera at ``center`` [3]."""
-    import open3d
+    open3d = open3d_kernels()
 
     starts = in_voxels(mesh, places.points + _OFF * mesh.voxel * places.normals).numpy()
     ends = in_voxels(mesh, center[None]).numpy()

@@ -21,6 +21,7 @@ from beags_plugin.export.base import Viewpoints
 from beags_plugin.export.close_up import close_up
 from beags_plugin.export.frames import bounding_box
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth, surfel_inputs
+from beags_plugin.system.open3d_kernels import open3d_kernels
 
 BLOCK = 16
 """Voxels along a side of the blocks that Open3D allocates as a whole."""
@@ -106,7 +107,7 @@ def fuse(
 
 def _new_grid() -> Any:
     """Return an empty ``VoxelBlockGrid`` of Open3D, whose unit is a voxel."""
-    import open3d
+    open3d = open3d_kernels()
 
     core = open3d.core
     return open3d.t.geometry.VoxelBlockGrid(
@@ -149,7 +150,7 @@ def _in_voxels(camera: Camera, low: Tensor, voxel: float) -> tuple[np.ndarray, n
 
 def _integrate(grid: Any, depth: Tensor, color: Tensor, pose: tuple[np.ndarray, np.ndarray], truncation: float) -> bool:
     """Add a view to the grid; return whether that changed it."""
-    import open3d
+    open3d = open3d_kernels()
 
     K, viewmat = (open3d.core.Tensor(matrix) for matrix in pose)
     depth_image = open3d.t.geometry.Image(open3d.core.Tensor(depth.float().contiguous().numpy()))
@@ -199,7 +200,7 @@ def decimated(mesh: Mesh, most: int) -> Mesh:
     """Return the mesh with at most ``most`` faces: edges collapse where that moves the surface least."""
     if len(mesh.faces) <= most:
         return mesh
-    import open3d
+    open3d = open3d_kernels()
 
     origin = mesh.vertices.mean(axis=0)  # quadrics lose digits far from the origin
     full = open3d.geometry.TriangleMesh(

@@ -19,6 +19,7 @@ from beags_plugin.export.placing import Placed, placed
 from beags_plugin.export.surface import area_vectors
 from beags_plugin.export.texture import Texture, textured
 from beags_plugin.extraction.files import whole_file
+from beags_plugin.system.open3d_kernels import open3d_kernels
 from beags_plugin.system.progress import progress_bar
 
 FEWEST, MOST, PER_GAUSSIAN = 1000, 20_000, 20
@@ -135,7 +136,7 @@ class MeshExporter(MeshOptions, Exporter):
 def open3d_missing() -> str | None:
     """Return None if Open3D can be loaded, else one sentence: why not and what to install."""
     try:
-        import open3d  # noqa: F401
+        open3d_kernels()
     except (ImportError, OSError) as error:  # a system library that it needs may be missing
         return f"Open3D cannot be loaded ({error}); pip install open3d, which needs libX11 and libGL."
     return None

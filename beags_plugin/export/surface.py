@@ -8,6 +8,7 @@ import numpy as np
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.export.fusion import Mesh
+from beags_plugin.system.open3d_kernels import open3d_kernels
 
 
 def area_vectors(mesh: Mesh) -> np.ndarray:
@@ -29,7 +30,7 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
 
 def surface_of(mesh: Mesh) -> Any:
     """Return Open3D's scene of a mesh, whose unit is the voxel and origin the mesh's first vertex (float32)."""
-    import open3d
+    open3d = open3d_kernels()
 
     scene, tensor = open3d.t.geometry.RaycastingScene(), open3d.core.Tensor
     scene.add_triangles(in_voxels(mesh, mesh.vertices), tensor(mesh.faces.astype(np.uint32)))
@@ -38,7 +39,7 @@ def surface_of(mesh: Mesh) -> Any:
 
 def in_voxels(mesh: Mesh, points: np.ndarray) -> Any:
     """Return Open3D's tensor of points [P, 3] in the frame of ``surface_of``."""
-    import open3d
+    open3d = open3d_kernels()
 
     return open3d.core.Tensor(((points - mesh.vertices[0]) / mesh.voxel).astype(np.float32))
 
@@ -49,7 +50,7 @@ def rays_through(mesh: Mesh, camera: Camera, xy: np.ndarray) -> tuple[Any, np.nd
     Their parameter is the depth along the camera's z, in the mesh's unit. The second are their ways [P, 3] in a unit of
     depth.
     """
-    import open3d
+    open3d = open3d_kernels()
 
     K = camera.K.double().numpy()
     ways = np.concatenate([(xy - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones((len(xy), 1))], axis=1)

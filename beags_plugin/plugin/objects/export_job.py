@@ -130,7 +130,7 @@ class ExportJob:
                 raise
             frame, doubt = self.local or self.world, error
         views = None if self.views is None else frame.views(self.views)
-        photos, no_photos = self._photos(class_id, frame)
+        photos, no_photos = self._photos(class_id, chosen, frame)
         item = ExportItem(
             name, frame.surfels(chosen), class_ids, views, on_render=steps.on_render, photos=photos,
             no_photos=no_photos, in_metres=self.metres is not None,
@@ -184,12 +184,13 @@ class ExportJob:
             center[2] = low[2] if floor is None else floor
         return frame.centred(center)
 
-    def _photos(self, class_id: int | None, frame: Frame) -> tuple[Sequence[Photo] | None, str]:
+    def _photos(self, class_id: int | None, part: Surfels, frame: Frame) -> tuple[Sequence[Photo] | None, str]:
         """Return the photos of an item in ``frame``, if an exporter needs them, or None and why there are none."""
         if not any(exporter.needs_photos for exporter in self.exporters.values()):
             return None, "no exporter asked for photos"
         shown, doubt = self.shown.scene()
-        return (None, doubt) if shown is None else (photos_of(shown, class_id, frame), "")
+        photos = None if shown is None else photos_of(shown, class_id, part, frame)
+        return (photos, "") if photos else (None, doubt or "no photo shows it")
 
     def _write(
         self, label: str, exporter: Exporter, path: Path, item: ExportItem, class_id: int | None

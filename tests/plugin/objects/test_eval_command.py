@@ -25,6 +25,7 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.model import BeagsModel
 from beags_plugin.plugin.objects.evaluate import EvaluatedRun, evaluate_run
 from beags_plugin.plugin.objects.extract import extract_objects
+from beags_plugin.plugin.runs.place import open_for_training
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs
@@ -224,13 +225,15 @@ def test_photographs_with_alpha_stand_on_the_background_of_the_training(tmp_path
     error = np.mean((rendered(config, discs()[0], 0, value).color.clamp(0, 1).numpy() - expected) ** 2)
     assert evaluate_run(config).after.views[0].psnr == pytest.approx(-10 * np.log10(error), abs=0.02)
 
-    batch = views.manager.fixed_indices_eval_dataloader[0][1]
+    options = open_for_training(config).data_config
+    manager = options.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
+    batch = manager.fixed_indices_eval_dataloader[0][1]
     random = torch.tensor([0.2, 0.5, 0.9])  # in training the photograph stands on the colour that was drawn
     model = type("Model", (), {"device": "cpu", "get_gt_img": BeagsModel.get_gt_img})()
     seen = BeagsModel._truth(model, batch, random)
     wanted = share * rgba[..., :3] / 255.0 + (1 - share) * random.numpy()
     np.testing.assert_allclose(seen.numpy(), wanted, atol=0.6 / 255)
-    opaque = views.manager.fixed_indices_eval_dataloader[1][1]
+    opaque = manager.fixed_indices_eval_dataloader[1][1]
     assert "alpha" not in opaque
     assert torch.equal(BeagsModel._truth(model, opaque, random), BeagsModel.get_gt_img(model, opaque["image"]))
 
