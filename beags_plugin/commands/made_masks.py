@@ -37,9 +37,10 @@ def made_masks(scene: Path, folder: Path) -> Path | None:
     from beags_plugin.masks.sources.salient import SalientSource
     from beags_plugin.plugin.objects.make_masks import make_masks
     from beags_plugin.plugin.views.data_options import DataOptions
+    from beags_plugin.plugin.views.scene_data import SceneData
 
     config = DataOptions(data=scene)
-    images = config.setup().posed_views()[1].images if fitting_layouts(scene) else list_photos(scene)
+    images = SceneData(config).posed_views()[1].images if fitting_layouts(scene) else list_photos(scene)
     photos, masks = _digest(images), folder / "masks"
     made = _read_stamp(folder / MADE)
     there = any(masks.rglob("*.png")) and made.get("masks") != UNFINISHED

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -38,6 +38,10 @@ class Places:
         return replace(self, points=self.points[chosen], normals=self.normals[chosen])
 
 
+Shown = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Which places a photo shows, their light, and their weights."""
+
+
 @dataclass(frozen=True)
 class Baked:
     """colors: [P, 3] float64, sRGB 0..1. seen: [P] bool, by a photo. exposures: [V, 3] of photos, 1 for their mean."""
@@ -63,7 +67,9 @@ def baked(
     """
     caster = surface_of(mesh)
     step = max(1, len(places.points) // _SAMPLES)
-    exposures = exposures_of(places[::step], mesh, caster, photos, lambda done: progress(done, 2 * len(photos)))
+    some = places[::step]
+    shown = (places_seen(some, mesh, caster, photo) for photo in photos)
+    exposures = exposures_of(len(some.points), len(photos), shown, lambda done: progress(done, 2 * len(photos)))
     total = _PRIOR * linear_from_srgb(prior)
     weights = np.full(len(places.points), _PRIOR)
     for done, (photo, exposure) in enumerate(zip(photos, exposures, strict=True), start=1):
@@ -74,7 +80,7 @@ def baked(
     return Baked(srgb_from_linear(total / weights[:, None]), weights > _PRIOR, exposures)
 
 
-def places_seen(places: Places, mesh: Mesh, caster: Any, photo: Photo) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def places_seen(places: Places, mesh: Mesh, caster: Any, photo: Photo) -> Shown:
     """Return which places a photo shows, [M] int64, their light [M, 3] there and its weights [M]."""
     camera = photo.camera
     xy, z = (values.numpy() for values in project(torch.from_numpy(places.points), camera.to(torch.float64)))
@@ -122,17 +128,14 @@ def interpolated(image: Tensor, xy: np.ndarray) -> np.ndarray:
     return (1 - v) * top + v * ((1 - u) * pixels[below, x] + u * pixels[below, right])
 
 
-def exposures_of(
-    places: Places, mesh: Mesh, caster: Any, photos: Sequence[Photo], progress: Callable[[int], None]
-) -> np.ndarray:
+def exposures_of(places: int, count: int, shown: Iterable[Shown], progress: Callable[[int], None]) -> np.ndarray:
     """Return [V, 3], how many times as bright as the mean each photo shows places, by colour.
 
+    places, count: their number P, and that of photos, V. shown: what ``places_seen`` returns of each photo.
     By ``core.exposure.even_exposures``; rounded, so that no last bit of a solver tells.
     """
-    count = len(photos)
-    logs, weights = (np.zeros((len(places.points), count, 3)) for _ in range(2))
-    for view, photo in enumerate(photos):
-        index, light, weight = places_seen(places, mesh, caster, photo)
+    logs, weights = (np.zeros((places, count, 3)) for _ in range(2))
+    for view, (index, light, weight) in enumerate(shown):
         usable = (light > DARK) & (light < BRIGHT)
         logs[index, view] = np.log(np.where(usable, light, 1.0))
         weights[index, view] = usable * np.minimum(weight, 1.0)[:, None] ** (1 / _SHARPEN)

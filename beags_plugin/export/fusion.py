@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.lifting import TAU, lift
+from beags_plugin.core.lifting import TAU, lift, project
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import Viewpoints
 from beags_plugin.export.close_up import close_up
@@ -25,6 +25,8 @@ from beags_plugin.system.open3d_kernels import open3d_kernels
 
 BLOCK = 16
 """Voxels along a side of the blocks that Open3D allocates as a whole."""
+FEWEST, MOST, VOXELS_PER_PIXEL = 48, 128, 1.25
+"""Voxels along the longest side of an object where no number of them was asked for."""
 PIXELS_PER_VOXEL = 2
 """Of the renders: discs smaller than a pixel are rendered a pixel wide, on slanted surfaces too near."""
 _VOXEL_BYTES = 20  # distance, weight and three colours, float32 each
@@ -63,6 +65,18 @@ def _grid_mb(sides: Tensor, voxel: float, truncation: float) -> float:
     # Two more blocks: the box starts and ends anywhere in one.
     blocks = math.prod(math.ceil(float(side) / voxel / BLOCK + 2 * truncation / BLOCK) + 2 for side in sides)
     return blocks * BLOCK**3 * _VOXEL_BYTES / 1e6
+
+
+def suitable_resolution(surfels: Surfels, cameras: Sequence[Camera]) -> int:
+    """Return voxels along the longest side of a box: ``VOXELS_PER_PIXEL`` where a photo shows it largest.
+
+    Finer ones would take time, and show nothing that a photo does. cameras: of the photos, not of close-ups.
+    """
+    low, high = bounding_box(surfels)
+    middle, side = (low + high)[None] / 2, float((high - low).max())
+    depths = (float(project(middle, camera.to(torch.float64))[1]) for camera in cameras)
+    pixels = [side * camera.focal / z for camera, z in zip(cameras, depths, strict=True) if z > side / 2]
+    return MOST if not pixels else min(MOST, max(FEWEST, math.ceil(VOXELS_PER_PIXEL * max(pixels))))
 
 
 @torch.no_grad()

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from beags_plugin.export.base import Exporter, ExportItem, NothingToExport
 from beags_plugin.export.closing import Closed, closed
-from beags_plugin.export.fusion import Mesh, decimated, fuse, without_small_parts
+from beags_plugin.export.fusion import Mesh, decimated, fuse, suitable_resolution, without_small_parts
 from beags_plugin.export.glb import glb_bytes
 from beags_plugin.export.gltf import glb_to_world
 from beags_plugin.export.mesh_options import MeshOptions
@@ -30,7 +30,8 @@ def seen_surface(item: ExportItem, options: MeshOptions) -> Mesh:
     """Return the surface that the training views see of an item rendered alone, maybe of no face; made once."""
     if item.views is None:
         raise ValueError("a surface needs the views of the training photos")
-    chosen = options.resolution, options.truncation, options.memory_mb, options.min_views
+    resolution = options.resolution or suitable_resolution(item.surfels, item.views.cameras)
+    chosen = resolution, options.truncation, options.memory_mb, options.min_views
     fused = item.shared.get(("fused", chosen))
     if fused is None:
         fused = item.shared["fused", chosen] = fuse(item.surfels, item.views, *chosen, item.on_render)

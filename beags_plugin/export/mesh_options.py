@@ -17,8 +17,8 @@ TEXTURES = ("photos", "none")
 class MeshOptions:
     """Options of making a mesh from the depth that the training views see."""
 
-    resolution: int = 128
-    """Meshes: voxels along the object's longest side."""
+    resolution: int = 0
+    """Meshes: voxels along the object's longest side; 0 chooses up to 128, by how many pixels photos have there."""
     truncation: float = 6.0
     """Meshes: voxels on either side of a surface that are averaged; more bridges depths that disagree, but the two
     sides of a wall thinner than twice as many draw together."""
@@ -36,8 +36,10 @@ class MeshOptions:
     """Texels along a side of the texture; 0 chooses what suits the photos."""
 
     def __post_init__(self) -> None:
-        if not 8 <= self.resolution <= MOST_VOXELS:
-            raise UserError(f"resolution is {self.resolution}: give 8 to {MOST_VOXELS} voxels along the longest side.")
+        if self.resolution != 0 and not 8 <= self.resolution <= MOST_VOXELS:
+            raise UserError(
+                f"resolution is {self.resolution}: give 8 to {MOST_VOXELS} voxels along the longest side, or 0."
+            )
         if not 1.0 <= self.truncation <= 64.0:
             raise UserError(f"truncation is {self.truncation}: it must lie in 1..64 voxels.")
         if not (self.memory_mb >= 50.0 and math.isfinite(self.memory_mb)):

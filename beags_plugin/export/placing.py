@@ -9,7 +9,7 @@ still fits the masks.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from beags_plugin.core.lifting import TAU, project
-from beags_plugin.export.baking import Places, exposures_of, interpolated, places_seen
+from beags_plugin.export.baking import Places, Shown, exposures_of, interpolated, places_seen
 from beags_plugin.export.base import Photo
 from beags_plugin.export.color import linear_from_srgb
 from beags_plugin.export.fusion import Mesh
@@ -153,22 +153,29 @@ def _disagreement(
     The second is [P, K], the variance of the root of light at places moved by each of the steps.
     """
     caster = surface_of(mesh)
-    exposures = exposures_of(places, mesh, caster, photos, progress)
+    shown: list[Shown] = []
+
+    def looked_at() -> Iterator[Shown]:
+        for photo in photos:
+            shown.append(places_seen(places, mesh, caster, photo))
+            yield shown[-1]
+
+    exposures = exposures_of(len(places.points), len(photos), looked_at(), progress)
     count, steps = len(places.points), len(_STEPS)
     weight, seen = np.zeros(count), np.zeros(count, np.int64)
     first, second = np.zeros((count, steps, 3)), np.zeros((count, steps, 3))
     for view, (photo, exposure) in enumerate(zip(photos, exposures, strict=True)):
-        index, _, sharp = places_seen(places, mesh, caster, photo)
+        index, _, sharp = shown[view]
         sharp = np.minimum(sharp, 1.0) ** (1 / 3)
         weight[index] += sharp
         seen[index] += 1
         camera, image = photo.camera.to(torch.float64), photo.image()
-        for step, by in enumerate(_STEPS):
-            there = places.points[index] + (by * pixel[index])[:, None] * places.normals[index]
-            xy = project(torch.from_numpy(there), camera)[0].numpy()
-            root = np.sqrt(linear_from_srgb(interpolated(image, xy)) / exposure)
-            first[index, step] += sharp[:, None] * root
-            second[index, step] += sharp[:, None] * root**2
+        by = (pixel[index, None] * _STEPS)[..., None]
+        there = (places.points[index, None] + by * places.normals[index, None]).reshape(-1, 3)
+        xy = project(torch.from_numpy(there), camera)[0].numpy()
+        root = np.sqrt(linear_from_srgb(interpolated(image, xy)) / exposure).reshape(-1, steps, 3)
+        first[index] += sharp[:, None, None] * root
+        second[index] += sharp[:, None, None] * root**2
         progress(len(photos) + view + 1)
     some = np.maximum(weight, 1e-300)[:, None, None]
     variance = np.maximum(second / some - (first / some) ** 2, 0.0).sum(axis=2)

@@ -78,21 +78,22 @@ class Run:
         return raster_settings(self.scene)
 
     @cached_property
-    def _parser(self) -> SceneData:
-        return SceneData(view_options(self.config).dataparser)
+    def _data_alone(self) -> SceneData:
+        return SceneData(view_options(self.config).dataparser, truth=False)
 
     def views(self, held_out: Literal["val", "test"]) -> RunData:
-        """Return the data that it was trained on; held_out: the split of the views that it was not."""
+        """Return the data that it was trained on; held_out: the split of other views, "test" with exact masks."""
         if held_out not in self._splits:
             with self._reading_data():
-                self._splits[held_out] = RunData(view_options(self.config), held_out, self._parser)
+                known = self._data_alone if held_out == "val" else None
+                self._splits[held_out] = RunData(view_options(self.config), held_out, known)
         return self._splits[held_out]
 
     @cached_property
     def viewpoints(self) -> Viewpoints:
         """Its training views, in its own frame; no photo is read, and lens distortion stays."""
         with self._reading_data():
-            cameras = self._parser.split("train").cameras
+            cameras = self._data_alone.split("train").cameras
         placed = [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
         return Viewpoints(placed, self.rasterizer, self.settings)
 

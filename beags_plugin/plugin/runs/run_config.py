@@ -47,8 +47,9 @@ class _Older(Exception):
 @lru_cache(None)
 def known_packages() -> frozenset[str]:
     """Return the packages whose classes configs may name: ours, nerfstudio, and those with entry points of either."""
-    groups = [group for group in entry_points().groups if group in _GROUPS or group.startswith("beags.")]
-    values = [point.value for group in groups for point in entry_points(group=group)]
+    every = entry_points()
+    groups = [group for group in every.groups if group in _GROUPS or group.startswith("beags.")]
+    values = [point.value for group in groups for point in every.select(group=group)]
     return frozenset({"beags_plugin", "nerfstudio", *(_package(value.partition(":")[0]) for value in values)})
 
 
@@ -211,7 +212,7 @@ def read_run_config(path: Path) -> RunConfig:
         finally:
             loader.dispose()
         if isinstance(config, RunConfig):
-            config.source = yaml.compose(text)
+            config.source = node
         return config
 
     return _loaded(path, both, RunConfig)

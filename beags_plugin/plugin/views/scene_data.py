@@ -50,10 +50,14 @@ class SplitData:
 
 
 class SceneData:
-    """A scene that options name, read when it is first asked for; every user error is a ``UserError``."""
+    """A scene that options name, read when it is first asked for; every user error is a ``UserError``.
 
-    def __init__(self, config: DataOptions) -> None:
+    truth: whether to look for exact masks too, which evaluation alone needs.
+    """
+
+    def __init__(self, config: DataOptions, truth: bool = True) -> None:
         self.config = config
+        self._truth = truth
         self._views: PosedViews | None = None
         self._metadata: dict[str, Any] = {}
 
@@ -131,8 +135,8 @@ class SceneData:
             "mask_kind": kind,
             "no_truth": folder / NO_TRUTH if (folder / NO_TRUTH).exists() else None,
             "ignore_ids": tuple(config.ignore_ids),
-            "ground_truth": find_ground_truth(scene, *truth),
-            "stray_truth": stray_note(*truth),
+            "ground_truth": find_ground_truth(scene, *truth) if self._truth else None,
+            "stray_truth": stray_note(*truth) if self._truth else None,
         }
 
     def _check_named(self, masks: Path, classes: Path) -> None:
