@@ -19,12 +19,21 @@ from scipy.spatial import cKDTree
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import project
+from beags_plugin.core.surfels import Surfels
 from beags_plugin.export import fusion
 from beags_plugin.export.base import ExportItem, NothingToExport, Viewpoints, make_exporter
 from beags_plugin.export.close_up import close_up
 from beags_plugin.export.color import linear_from_srgb
 from beags_plugin.export.frames import bounding_box
-from beags_plugin.export.fusion import Mesh, _grid_mb, decimated, sorted_mesh, voxel_size, without_small_parts
+from beags_plugin.export.fusion import (
+    Mesh,
+    _grid_mb,
+    decimated,
+    sorted_mesh,
+    suitable_resolution,
+    voxel_size,
+    without_small_parts,
+)
 from beags_plugin.export.mesh import GlbExporter
 from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.rasterizers import make_rasterizer
@@ -257,6 +266,21 @@ def test_what_no_view_shows_is_refused(item):
     behind = replace(item, surfels=replace(item.surfels, means=item.surfels.means + 1000.0), shared={})
     with pytest.raises(NothingToExport, match="no surface of 'cup' is seen in 3 training views"):
         make_exporter("glb").write(None, behind)
+
+
+@pytest.mark.parametrize(("focal", "voxels"), [(10.0, 48), (59.5, 75), (1000.0, 128)])
+def test_voxels_are_as_fine_as_the_nearest_photo(focal, voxels):
+    part = Surfels.of(
+        torch.tensor([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(2, 1),
+        torch.full((2, 2), -9.0), torch.zeros(2), torch.zeros(2, 1, 3),
+    )  # fmt: skip
+    K = torch.tensor([[focal, 0.0, 50.0], [0.0, focal, 50.0], [0.0, 0.0, 1.0]])
+    cameras = []
+    for away in (2.0, 4.0, -3.0):  # the last one looks away from it
+        viewmat = torch.eye(4)
+        viewmat[2, 3] = away
+        cameras.append(Camera(viewmat, K, 100, 100))
+    assert suitable_resolution(part, cameras) == voxels  # 1.25 for each of 2 * focal / 2 pixels
 
 
 def test_without_open3d_a_user_error_explains_it(monkeypatch):
