@@ -70,7 +70,7 @@ def run_config(path: Path) -> Path:
     try:
         with path.open("rb") as file:
             text = file.read(LARGEST_CONFIG)
-        root = yaml.compose(text)
+        root = yaml.compose(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except OSError as error:
         raise UserError(f"{path} cannot be read ({reason(error)}): name the config.yml of a run.") from error
     except (yaml.YAMLError, ValueError, RecursionError):

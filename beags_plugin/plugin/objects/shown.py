@@ -7,12 +7,13 @@ from functools import cached_property
 
 from beags_plugin.cleaning.silhouettes import MaskedViews
 from beags_plugin.core.exposure import Exposures
-from beags_plugin.labels.label_maps import LabelMaps
+from beags_plugin.data.files import image_size
 from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, PREPARED, preparing_run
 from beags_plugin.plugin.runs.prepared import prepared_labels
 from beags_plugin.plugin.runs.run import Run
 from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.run_data import RunData
+from beags_plugin.plugin.views.streaming import Lazy
 from beags_plugin.plugin.views.views import View, unique_names
 from beags_plugin.preparation.consistent_masks import render_depths
 from beags_plugin.system.errors import UserError
@@ -69,13 +70,16 @@ def shown_scene(run: Run) -> ShownScene:
     chosen = range(0, len(dataset), -(-len(dataset) // MOST_VIEWS))
     cameras = [camera_from_nerfstudio(dataset.cameras, index) for index in chosen]
     names = [unique_names(dataset.image_filenames)[index] for index in chosen]
+    files = [folder / "masks" / f"{name}.png" for name in names]
     try:
-        labels = LabelMaps(
-            prepared_labels(folder / "masks" / f"{name}.png", camera)
-            for name, camera in zip(names, cameras, strict=True)
+        fit = all(
+            image_size(file) == (camera.width, camera.height) for file, camera in zip(files, cameras, strict=True)
         )
-    except UserError as error:
-        raise Unshown("the masks that the run has kept do not fit its data") from error
+    except UserError:
+        fit = False
+    if not fit:
+        raise Unshown("the masks that the run has kept do not fit its data")
+    labels = Lazy(lambda index: prepared_labels(files[index], cameras[index]), len(files))
     rasterizer, settings = run.rasterizer, run.settings
     with progress_bar("Rendering depth", passing=True) as progress:
         surfels = scene.surfels().detach()
