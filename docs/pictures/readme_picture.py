@@ -21,7 +21,6 @@ from beags_plugin.pictures.objects import render_alone
 from beags_plugin.pictures.orbit import orbit, orbit_frame, orbit_settings
 from beags_plugin.plugin.objects.evaluate import EvaluatedRun
 from beags_plugin.plugin.objects.shown import shown_scene
-from beags_plugin.plugin.runs.read import training_viewpoints
 
 
 @dataclass
@@ -53,7 +52,7 @@ class Picture:
         }
         shown = shown_scene(run.stages["after"], self.load_config).views
         parts["after"] = parts["after"][clean(parts["after"], class_id, shown)[0]]
-        photos = training_viewpoints(run.stages["after"].config, run.settings, self.load_config).cameras
+        photos = run.run.viewpoints.cameras
         stand = orbit_frame(*bounding_box(parts["after"]), photos)
         cameras = orbit(stand, 12, self.height)
         rows = []

@@ -22,7 +22,7 @@ sys.path.append(str(Path(__file__).parents[2] / "tests/support"))
 from browser import Page  # noqa: E402
 from viewer_pages import viewed  # noqa: E402
 
-from beags_plugin.plugin.runs.read import read_assigned_run  # noqa: E402
+from beags_plugin.plugin.runs.run import Run  # noqa: E402
 from beags_plugin.system.errors import UserError  # noqa: E402
 
 
@@ -41,7 +41,7 @@ class Picture:
     """Pixels of the window."""
 
     def write(self) -> None:
-        scene = read_assigned_run(self.load_config)
+        scene = Run(self.load_config).assigned
         if self.object not in scene.classes.values():
             raise UserError(f"{self.load_config} has no object {self.object!r}.")
         with (

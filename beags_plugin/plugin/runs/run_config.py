@@ -247,6 +247,14 @@ def _loaded(path: Path, load: Callable[[str], Any], kind: type[Config]) -> Confi
     return config
 
 
+def drop_gone(node: yaml.Node) -> None:
+    """Drop options that are gone from a config's nodes, in place: nerfstudio's loader would look for their classes."""
+    if isinstance(node, yaml.MappingNode):
+        node.value = [(key, child) for key, child in node.value if child.tag.rpartition(":")[2] not in _GONE]
+        for _, child in node.value:
+            drop_gone(child)
+
+
 def with_values(node: yaml.Node, values: Mapping[str, Path | int | None]) -> None:
     """Set entries of a config's nodes in place, by dotted names."""
     for name, value in values.items():

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from beags_plugin.plugin.options.run_format import CONFIG_FILE
 from beags_plugin.plugin.runs.layout import TRANSFORM_FILE
-from beags_plugin.plugin.runs.run_config import RunConfig, with_values
+from beags_plugin.plugin.runs.run_config import RunConfig, drop_gone, with_values
 from beags_plugin.system.registry import load
 from beags_plugin.system.whole_files import write_text_atomically, write_whole
 
@@ -62,5 +62,6 @@ def _text(config: BeagsTrainerConfig | RunConfig, folder: Path) -> str:
     assert own.source is not None
     views = own.data_config
     data = {"pipeline.datamanager.data": views.data, "pipeline.datamanager.dataparser.data": views.dataparser.data}
+    drop_gone(own.source)
     with_values(own.source, {**first, "run_dir": folder, **data})
     return yaml.serialize(own.source, width=10_000)

@@ -96,3 +96,13 @@ def test_what_no_run_needs_is_refused(config, old, new, told):
     config.write_text(text.replace(old, new))
     with pytest.raises(UserError, match=told):
         read_run_config(config)
+
+
+def test_a_run_with_options_that_are_gone_still_opens(config, tmp_path):
+    gone = "    pyramid: !!python/object:beags_plugin.plugin.options.pyramid.PyramidConfig\n      levels: 2\n    near:"
+    text = config.read_text()
+    assert "    near:" in text
+    config.write_text(text.replace("    near:", gone))
+    assert read_run_config(config).model_config.near == load_run_config(config).model_config.near
+    made = write_run(open_run(config), tmp_path / "part", {}, 3)
+    assert "pyramid" not in made.read_text() and load_run_config(made).model_config.near == 0.01
