@@ -50,7 +50,7 @@ class Picture:
         parts = {
             stage: select_class(scene.surfels(), scene.members, class_id)[0] for stage, scene in run.stages.items()
         }
-        shown = shown_scene(run.stages["after"], self.load_config).views
+        shown = shown_scene(run.run).views
         parts["after"] = parts["after"][clean(parts["after"], class_id, shown)[0]]
         photos = run.run.viewpoints.cameras
         stand = orbit_frame(*bounding_box(parts["after"]), photos)
