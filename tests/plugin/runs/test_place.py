@@ -135,7 +135,16 @@ def test_trainings_go_where_the_run_lies(short_run, tmp_path):
     shutil.copytree(short_run / "data", data)
     old = files(short_run)
     for steps, words in {
-        20: ("ns-train", "beags-tiny", "--load-config", run / "config.yml", "--data", data),
+        20: (
+            "ns-train",
+            "beags-tiny",
+            "--load-config",
+            run / "config.yml",
+            "--data",
+            data,
+            "--overwrite",
+            "True",
+        ),  # fmt: skip
         57: ("beags", "resume", run, "--data", data),
     }.items():
         text = (run / "config.yml").read_text()
