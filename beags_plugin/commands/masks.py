@@ -1,4 +1,4 @@
-"""``beags masks``: check, make and reproject the masks of a scene."""
+"""``beags masks``: agree, check, make and reproject the masks of a scene."""
 
 from __future__ import annotations
 
@@ -107,6 +107,36 @@ class Reproject:
 
 
 @dataclass
+class Agree:
+    """Make masks agree that a network made: views that the others contradict lose their say, and are drawn anew.
+
+    Each Gaussian of a trained run gets one class, by the votes of all views and by cuts along creases, edges of depth
+    and changes of colour. Pixels that stay in doubt are written as unlabelled (65535).
+    """
+
+    load_config: Path
+    """Any trained run, its folder or config.yml in it; beags-base will do."""
+    masks_path: Path | None = None
+    """Folder of the id images, if not those that the run was trained on."""
+    classes_path: Path | None = None
+    """File {"id": "name"} for them; classes.json beside the folder if there is one."""
+    run_size: bool = False
+    """Work at the size that was trained on instead of that of the photographs: quicker, smaller masks."""
+    data: Path | None = None
+    """Folder of the photos, if not where the run was trained on them."""
+    output: Path | None = None
+    """Folder for masks, classes.json, report.json and doubt.png; agreed/ beside config.yml."""
+
+    def run(self) -> None:
+        with starting(self):
+            from beags_plugin.plugin.objects.agree_masks import agree_masks
+            from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions
+        options = ReprojectionOptions(self.masks_path, self.classes_path, run_size=self.run_size, data=self.data)
+        for line in agree_masks(self.load_config, options, self.output):
+            CONSOLE.print(line)
+
+
+@dataclass
 class Make:
     """Make masks with a registered source (docs/masks.md), write them where ns-train finds them, and check them."""
 
@@ -197,7 +227,7 @@ class Weights:
 class Masks:
     """Check the masks of a scene, make them consistent, or make them in the first place."""
 
-    action: Check | Make | Reproject | Truth | Weights
+    action: Agree | Check | Make | Reproject | Truth | Weights
 
     def run(self) -> None:
         self.action.run()

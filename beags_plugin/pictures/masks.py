@@ -47,8 +47,8 @@ def overlay(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return np.where((labels != 0)[..., None], 0.5 * photo + 0.5 * tint, photo).astype(np.uint8)
 
 
-def before_and_after(path: Path, views: Sequence[Changed]) -> None:
-    """Write a picture with a line per view: mask before, mask after, changes, confidence."""
+def before_and_after(path: Path, views: Sequence[Changed], legend: str | None = None) -> None:
+    """Write a picture with a line per view: mask before, mask after, changes, confidence; legend: of its grey values."""
     lines = []
     for view in views:
         height, width = view.voted.shape
@@ -65,7 +65,7 @@ def before_and_after(path: Path, views: Sequence[Changed]) -> None:
             (before, f"{view.name}: before"),
             (overlay(view.photo, view.voted), "after"),
             (marked, text),
-            (grey, f"share of the winning votes, mean {view.confidence.mean() / 255:.3f}"),
+            (grey, legend or f"share of the winning votes, mean {view.confidence.mean() / 255:.3f}"),
         ]
         lines.append(beside([cell(image, size, caption) for image, caption in cells]))
     write_picture(path, below(lines))

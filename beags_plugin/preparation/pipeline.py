@@ -21,6 +21,7 @@ from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.preparation.agreed import AgreementReport, agree
 from beags_plugin.preparation.consistent_masks import (
     AUTO,
     ConsistentMasks,
@@ -51,6 +52,9 @@ class PreparationConfig:
     """Of pairwise: a vote counts if its point is visible, |z - depth| <= tau z; inf counts every vote (E5)."""
     depth: str = "median"
     """Which depth is lifted: median or expected."""
+    agree: bool = False
+    """Weigh the views' masks by how far each agrees with the others, and draw them anew where one decision per Gaussian
+    contradicts them: for masks that a network made, whose errors many views share."""
     k: int = 2000
     """Neighbours that set the voxel size (E8); more make larger voxels."""
     k_pixels: int = 0
@@ -86,6 +90,7 @@ class Preparation:
     assignment: classes of the base.
     grid: the visibility voxel grids, or None if the refiner needs none.
     members: the objects, where the refiner says more than the classes do.
+    agreement: what making the masks agree changed, where that was asked for.
     summary: a line of text per stage. seconds: wall time per stage.
     """
 
@@ -94,6 +99,7 @@ class Preparation:
     assignment: Assignment
     grid: VisibilityGrid | None
     members: Membership | None = None
+    agreement: AgreementReport | None = None
     summary: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -130,6 +136,11 @@ def prepare(
     summary: list[str] = []
     seconds: dict[str, float] = {}
 
+    agreement = None
+    if config.agree:
+        with _timed("agreement", seconds):
+            maps, agreement = agree(surfels, cameras, maps, known, rasterizer, settings, stage)
+        summary.append(f"agreement: {agreement.sentence()}")
     with _timed("reprojection", seconds):
         masks = _consistent_masks(surfels, cameras, maps, known, rasterizer, settings, config, stage, summary)
     with _timed("assignment", seconds), stage("Assigning classes") as progress:
@@ -166,7 +177,7 @@ def prepare(
     start = time.perf_counter()
     if (members := refiner.members(scene)) is not None:
         seconds["objects"] = time.perf_counter() - start
-    return Preparation(masks.labels, masks.confidence, assignment, grid, members, summary, seconds)
+    return Preparation(masks.labels, masks.confidence, assignment, grid, members, agreement, summary, seconds)
 
 
 def check_masks(labels: Iterable[Tensor | None]) -> None:

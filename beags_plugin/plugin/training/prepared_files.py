@@ -47,6 +47,8 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path, fit: Re
                 with writing(path):  # cv2 would ignore a full disk
                     Image.fromarray(prepared.confidence[index].cpu().numpy()).save(path)
     report = {"summary": prepared.summary, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
+    if prepared.agreement is not None:
+        report["agreement"] = prepared.agreement.to_json(names)
     if fit is not None:
         report["residuals"] = {**vars(fit), "contradict": fit.contradict}
     write_text_atomically(json.dumps(report, indent=2), folder / PREPARATION_REPORT)

@@ -1,0 +1,103 @@
+"""Masks of all views that agree in space (``picking.agreement``), and figures on what that changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.labels.class_ranks import ClassRanks
+from beags_plugin.labels.label_maps import LabelMaps
+from beags_plugin.picking.agreement import AgreedMask, agreed_masks, decide
+from beags_plugin.preparation.consistent_masks import Stage, translated
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+
+NAMED = 6  # views in a sentence
+
+
+@dataclass(frozen=True)
+class AgreementReport:
+    """What agreement did to the masks of V views.
+
+    errors: [V], share of what a view or the others call objects on which it contradicts them; None without a mask.
+    overruled: views whose masks are not believed at all, or show nothing. changed, doubtful: [V], shares of pixels with
+    another class than given, and left unlabelled.
+    """
+
+    errors: list[float | None]
+    overruled: list[int]
+    changed: list[float]
+    doubtful: list[float]
+
+    @property
+    def agreement(self) -> float:
+        """Return the mean share of the objects on which a view and the others agree, 0..1; 1 without a mask."""
+        known = [1.0 - error for error in self.errors if error is not None]
+        return float(np.mean(known)) if known else 1.0
+
+    def to_json(self, names: Sequence[str]) -> dict[str, Any]:
+        """Return plain values; names: of the views."""
+        rows = zip(names, self.errors, self.changed, self.doubtful, strict=True)
+        return {
+            "agreement": round(self.agreement, 4),
+            "masks": sum(error is not None for error in self.errors),
+            "overruled": [names[view] for view in self.overruled],
+            "changed": round(float(np.mean(self.changed)), 5),
+            "doubtful": round(float(np.mean(self.doubtful)), 5),
+            "views": [
+                {"view": name, "contradicts": error, "changed": round(changed, 5), "doubtful": round(doubtful, 5)}
+                for name, error, changed, doubtful in rows
+            ],
+        }
+
+    def sentence(self, names: Sequence[str] | None = None) -> str:
+        """Return a line for users; names: of the views, to name those that were overruled."""
+        count = sum(error is not None for error in self.errors)
+        line = f"the views agree on {100 * self.agreement:.0f} % of what they call an object"
+        if self.overruled:
+            line += f"; {len(self.overruled)} of {count} masks were overruled as a whole"
+            if names is not None:
+                rest = len(self.overruled) - NAMED
+                line += f" ({', '.join(names[view] for view in self.overruled[:NAMED])}"
+                line += f" and {rest} more)" if rest > 0 else ")"
+        changed, doubtful = (100 * float(np.mean(share)) for share in (self.changed, self.doubtful))
+        return f"{line}; {changed:.2f} % of all pixels got another class, {doubtful:.2f} % are in doubt and left out"
+
+
+def agree(
+    surfels: Surfels,
+    cameras: Sequence[Camera],
+    maps: LabelMaps,
+    known: ClassRanks,
+    rasterizer: Rasterizer,
+    settings: RasterSettings,
+    stage: Stage,
+    reach: int = 1,
+    photos: Sequence[Callable[[], np.ndarray]] | None = None,
+    take: Callable[[int, AgreedMask], None] = lambda view, mask: None,
+) -> tuple[LabelMaps, AgreementReport]:
+    """Return the labels of V views, class ids, as one decision per Gaussian has them, and what that changed.
+
+    known: the classes. take: receives the number of each view and its mask, in ranks of ``known``. Other arguments as
+    of ``picking.agreement``.
+    """
+    given = translated(maps, known, known.ranks)
+    with stage("Weighing masks") as progress:
+        found = decide(surfels, cameras, given, rasterizer, settings, len(known), progress)
+    ranked, changed, doubtful = LabelMaps(), [], []
+    with stage("Drawing agreed masks") as progress:
+        masks = agreed_masks(found, surfels, cameras, given, rasterizer, settings, len(known), reach, photos)
+        for view, mask in enumerate(masks):
+            take(view, mask)
+            ranked.append(mask.labels)
+            changed.append(float(mask.changed.float().mean()) if given.stored[view] is not None else 0.0)
+            doubtful.append(float(mask.doubtful.float().mean()))
+            if progress is not None:
+                progress(view + 1, len(cameras))
+    errors = [None if np.isnan(error) else round(float(error), 4) for error in found.errors]
+    return translated(ranked, known, known.class_ids), AgreementReport(errors, found.silenced, changed, doubtful)
+
