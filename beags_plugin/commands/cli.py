@@ -51,11 +51,13 @@ class Demo:
     """Seed of the generated sample."""
     fresh: bool = False
     """Train again even if the same demo has been trained before."""
+    strict: bool = False
+    """Stop where masks contradict one another, before anything is trained."""
 
     def run(self) -> None:
         with starting(self):
             from beags_plugin.commands.demo import run_demo
-        run_demo(self.data, self.output, self.preset, self.downscale, self.seed, self.fresh)
+        run_demo(self.data, self.output, self.preset, self.downscale, self.seed, self.fresh, self.strict)
 
 
 @dataclass

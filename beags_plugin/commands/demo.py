@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
 import subprocess
 import sys
@@ -31,12 +32,15 @@ CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may ho
 STAMP = "trained.json"  # beside the run: the request that it was made from
 STARTED = "started"  # in there, holds the request until the training ends
 PRESET, PRESET_OF_PHOTOS = "beags-tiny", "beags-fast"
+AGREE = ("--pipeline.model.prepare.agree", "True")  # a network's masks err in many views alike
+QUIET = ("--logging.steps-per-log", "50", "--logging.local-writer.max-log-size", "0")  # where no table can be redrawn
 SHEET_VIEWS = 3  # held-out views in the picture
 
 
 def run_demo(
-    data: Path | None, output: Path | None, preset: str | None, downscale: float | None, seed: int, fresh: bool
-) -> None:
+    data: Path | None, output: Path | None, preset: str | None, downscale: float | None, seed: int, fresh: bool,
+    strict: bool = False,
+) -> None:  # fmt: skip
     """Run the whole demo in ``output`` and print the table; see ``cli.Demo`` for the arguments."""
     from beags_plugin.commands.made_scene import MadeScene, made_scene, name_of
     from beags_plugin.data.layout import read_dataset
@@ -61,6 +65,8 @@ def run_demo(
             raise UserError(f"{output} is the data: give another --output.")
         with timed(seconds, "poses and masks"):
             scene = made_scene(data, output)
+        if strict:
+            check_contradictions(scene, output)
         read_dataset(scene.data)  # reports what is missing before a training starts
         downscale = downscale or quick_downscale(scene.data)
     run = output / "run"
@@ -74,7 +80,26 @@ def run_demo(
             "The photos contradict each other outside the masks, as on a turntable: now with the objects' pixels alone."
         )
         _train_once(scene, output, alone, fresh, replace=True)
-    measure(run, output, seconds)
+    measure(run, output, seconds, scene)
+
+
+def check_contradictions(scene: MadeScene, output: Path) -> None:
+    """Raise ``UserError`` where the views contradict masks, as the points say that several saw (``beags masks check``).
+
+    output: of the demo, which gets contradicted.png.
+    """
+    from beags_plugin.plugin.objects.check_masks import check_scene, data_options, write_contradictions
+
+    given = {} if scene.labels is None else {"masks_path": (scene.labels / "masks").absolute()}
+    report = check_scene(data_options(scene.data, **given))
+    views = list(dict.fromkeys(one.view for one in report.contradictions))
+    if views:
+        picture = write_contradictions(report, output)[0]
+        named = ", ".join(views[:6]) + (f" and {len(views) - 6} more" if len(views) > 6 else "")
+        raise UserError(
+            f"{len(views)} masks contradict the others ({named}; see {picture}): correct or delete them, or leave "
+            "--strict out."
+        )
 
 
 def _train_once(scene: MadeScene, output: Path, request: dict[str, Any], fresh: bool, replace: bool = False) -> None:
@@ -161,6 +186,7 @@ def train(scene: MadeScene, run: Path, preset: str, downscale: float, photos: st
     words = [
         str(Path(sys.executable).parent / "ns-train"), preset, "--data", str(scene.data),
         "--run-dir", str(run.absolute()), "--vis", "tensorboard", "--pipeline.datamanager.photos", photos,
+        *(AGREE if scene.made_masks is not None and photos == "all" else ()), *(() if sys.stdout.isatty() else QUIET),
         "beags-data", "--downscale-factor", str(downscale), *scene.options(),
     ]  # fmt: skip
     CONSOLE.print(f"$ {command(words)}")
@@ -176,13 +202,15 @@ def resume(run: Path) -> None:
 
 
 def _finish(words: list[str]) -> None:
-    code = subprocess.run(bound(words)).returncode
+    quiet = {**os.environ, "PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS", "ignore::FutureWarning")}
+    code = subprocess.run(bound(words), env=quiet).returncode
     if code != 0:
         raise UserError(f"training ended with exit code {code}; what it printed above says why.")
 
 
-def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
-    """Compare assignment alone with refinement, extract every object, write summary.json and the picture."""
+def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene) -> None:
+    """Compare assignment alone with refinement, extract every object, write summary.json and the pictures."""
+    from beags_plugin.commands.certainty import certainty, write_doubt
     from beags_plugin.evaluation.table import render_run, summary_json
     from beags_plugin.pictures.cells import write_picture
     from beags_plugin.pictures.contact_sheet import contact_sheet, draw_rows, novel_camera
@@ -209,12 +237,19 @@ def measure(run: Path, output: Path, seconds: dict[str, float]) -> None:
     made = {name: seconds.pop(name) for name in ("sample", "poses and masks") if name in seconds}
     stages = {**made, **training["seconds"], **seconds}
     memory = training["peak_memory_mb"]
-    write_text_atomically(json.dumps(summary_json(metrics, stages, memory), indent=2), output / "summary.json")
+    sure = certainty(run, scene.data, scene.made_masks)
+    summary = {**summary_json(metrics, stages, memory), "certainty": sure.to_json()}
+    write_text_atomically(json.dumps(summary, indent=2), output / "summary.json")
+    doubt = write_doubt(run, output / "doubt.png")
     CONSOLE.print(render_run(metrics, stages, memory))
     CONSOLE.print(f"objects: {', '.join(str(item.ply) for item in extracted)}")
     CONSOLE.print(f"figures: {output / 'summary.json'}")
     CONSOLE.print(f"picture: {picture}")
+    if doubt:
+        CONSOLE.print(f"doubt:   {output / 'doubt.png'}")
     CONSOLE.print(f"look:    beags view {quoted(run)}")
+    for line in sure.lines:
+        CONSOLE.print(line)
 
 
 @contextmanager

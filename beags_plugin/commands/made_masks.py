@@ -60,6 +60,12 @@ def made_masks(scene: Path, folder: Path) -> Path | None:
     return None if folder == scene else folder
 
 
+def as_made(folder: Path) -> bool:
+    """Return whether the masks in a folder are those that the network made there, none of them mended."""
+    made = _read_stamp(folder / MADE).get("masks")
+    return made is not None and made != UNFINISHED and made == folder_digest(folder / "masks")
+
+
 def _digest(photos: Sequence[Path]) -> str:
     """Digest name, size and time of photos."""
     return value_digest([[path.name, path.stat().st_size, path.stat().st_mtime_ns] for path in photos])

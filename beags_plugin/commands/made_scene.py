@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from beags_plugin.commands.made_masks import MADE, check_source, made_masks
+from beags_plugin.commands.made_masks import MADE, as_made, check_source, made_masks
 from beags_plugin.commands.process import find_poses
 from beags_plugin.data.layout import fitting_layouts, read_dataset
 from beags_plugin.masks.sources.base import NothingFound
@@ -40,6 +40,12 @@ class MadeScene:
     data: Path
     labels: Path | None = None
     turned: bool = False
+
+    @property
+    def made_masks(self) -> Path | None:
+        """Return the folder of masks that a network made and nobody mended; None for others."""
+        folder = self.labels or self.data
+        return folder / "masks" if as_made(folder) else None
 
     def options(self) -> list[str]:
         """Return the options of ``beags-data`` that name its masks."""

@@ -100,4 +100,3 @@ def agree(
                 progress(view + 1, len(cameras))
     errors = [None if np.isnan(error) else round(float(error), 4) for error in found.errors]
     return translated(ranked, known, known.class_ids), AgreementReport(errors, found.silenced, changed, doubtful)
-

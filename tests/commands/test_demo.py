@@ -82,7 +82,7 @@ def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
     data, output = write_scene(tmp_path / "data"), tmp_path / "out"
     run, commands, measured = output / "run", [], []
 
-    def process(command):
+    def process(command, **_):
         (word,) = {"resume", "ns-train"} & {Path(part).name for part in command}
         commands.append(word)
         run.mkdir(exist_ok=True)

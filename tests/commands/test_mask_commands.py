@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from data_folders import HEIGHT, WIDTH, write_colmap, write_image, write_transforms
-from run_folders import write_scene, write_trained
+from run_folders import discs, write_drawn_scene, write_scene, write_trained
 from source_scenes import truth
 
 from beags_plugin.commands.cli import main
@@ -215,3 +215,22 @@ def test_the_geometry_of_a_run_has_its_held_out_views_too(tmp_path):
         assert tuple(geometry.depth(view).shape) == (camera.height, camera.width)
         straight = geometry.to_straight(ids.astype(np.uint16), view)
         np.testing.assert_array_equal(geometry.to_photo(straight, view), ids)  # this scene has no lens distortion
+
+
+def test_agreement_overrules_the_mask_that_contradicts_the_others(tmp_path, capsys):
+    data, names = tmp_path / "data", [f"v{index:02d}" for index in range(9)]
+    surfels, _ = discs()
+    write_drawn_scene(data)
+    right = {name: read_id_mask(data / f"masks/{name}.png") for name in names}
+    write_image(data / "masks/v03.png", np.where(right["v03"] == 1, 0, 1).astype(np.uint8))  # inverted
+    config = write_trained(tmp_path / "run", data, assigned=False)
+    main(["masks", "agree", "--load-config", str(config), "--output", str(tmp_path / "agreed")])
+    out = " ".join(capsys.readouterr().out.split())
+    assert "1 of 7 masks were overruled as a whole (v03)" in out and "--masks-path" in out
+    report = json.loads((tmp_path / "agreed/report.json").read_text())
+    assert report["overruled"] == ["v03"] and (tmp_path / "agreed/doubt.png").exists()
+    for name in sorted(set(names[1:8])):
+        found = read_id_mask(tmp_path / f"agreed/masks/{name}.png")
+        wrong = (found != right[name]) & (found != IGNORE)
+        assert wrong.mean() < (0.05 if name == "v03" else 0.003), name
+    assert len(surfels) and json.loads((tmp_path / "agreed/classes.json").read_text())["1"] == "cup"

@@ -48,6 +48,11 @@ def test_a_view_without_a_mask_gets_what_the_others_vote_and_in_a_tie_each_keeps
     assert prepared([1, None, 2]) == [[1], [IGNORE], [2]]
 
 
+def test_a_mask_that_contradicts_the_others_is_overruled_where_agreement_is_asked_for():
+    assert prepared([1, 1, 1, 1, 2], reprojection="none") == [[1]] * 4 + [[2]]
+    assert prepared([1, 1, 1, 1, 2], reprojection="none", agree=True) == [[1]] * 5
+
+
 @pytest.mark.parametrize(
     ("views", "side", "masks", "expected"),
     [

@@ -1,0 +1,130 @@
+"""How sure ``beags demo`` is of what it made, in words: for its last lines and for summary.json."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
+from beags_plugin.system.pasted import quoted
+
+SURE, FAIR = 0.9, 0.75  # of the agreement between views, from which on the demo is sure, and fairly sure
+MANY = 0.1  # of the masks: with more overruled as a whole, it is not sure
+NAMED = 6  # photos in a sentence
+SMALL = 150  # pixels: an object whose longer side has fewer shows no print
+PICTURES = 6  # views in doubt.png
+
+
+@dataclass(frozen=True)
+class Certainty:
+    """level: "sure", "fairly sure", "not sure", or "not judged" without masks that a network made. lines: sentences for
+    the user, what to do next among them. figures: what they are made of, plain values."""
+
+    level: str
+    lines: list[str]
+    figures: dict[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values for summary.json."""
+        return {"level": self.level, "sentences": self.lines, **self.figures}
+
+
+def certainty(run: Path, scene: Path, masks: Path | None = None) -> Certainty:
+    """Judge a finished demo. run: its run. scene: its photos' folder, with poses.json if poses were made. masks: the
+    folder of masks that were made, from which some may be deleted."""
+    lines, figures = [], {}
+    agreement = _json(run / "prepared/report.json").get("agreement")
+    level = "not judged" if agreement is None else _level(agreement)
+    if agreement is not None:
+        figures["agreement"] = {name: agreement[name] for name in ("agreement", "masks", "overruled", "doubtful")}
+        lines.append(_of_masks(level, agreement))
+    poses = _json(scene / "poses.json")
+    if {"photos", "registered"} <= set(poses):
+        without = int(poses["photos"]) - int(poses["registered"])
+        figures["photos without poses"] = without
+        if without:
+            lines.append(f"{without} of {poses['photos']} photos have no pose and were left out.")
+    if (size := _size(run / "prepared/masks")) is not None:
+        figures["object pixels"] = list(size)
+        finer = ": for more detail, add --downscale 1" if max(size) < SMALL else ""
+        lines.append(f"The object has about {size[0]} x {size[1]} pixels in the photos as they were trained on{finer}.")
+    if level in ("fairly sure", "not sure"):
+        lines += _next(run, agreement, masks)
+    return Certainty(level, lines, figures)
+
+
+def _level(agreement: dict[str, Any]) -> str:
+    overruled = len(agreement["overruled"]) / max(agreement["masks"], 1)
+    if agreement["agreement"] < FAIR or overruled > MANY:
+        return "not sure"
+    return "sure" if agreement["agreement"] >= SURE and not overruled else "fairly sure"
+
+
+def _of_masks(level: str, agreement: dict[str, Any]) -> str:
+    line = f"How sure: {level}. The views agree on {100 * agreement['agreement']:.0f} % of what they call the object"
+    if agreement["overruled"]:
+        line += f"; {len(agreement['overruled'])} of {agreement['masks']} masks were overruled as a whole"
+    return f"{line}; {100 * agreement['doubtful']:.1f} % of all pixels are in doubt and were left out."
+
+
+def _next(run: Path, agreement: dict[str, Any], masks: Path | None) -> list[str]:
+    config = run / "base" / "config.yml"
+    lines = ["If the object is not what you meant, pick it by a few clicks, and press Save as masks:",
+             f"    ns-viewer --load-config {quoted(config)}"]  # fmt: skip
+    if masks is not None and agreement["overruled"]:
+        names = [quoted(masks / f"{name}.png") for name in agreement["overruled"][:NAMED]]
+        more = len(agreement["overruled"]) - len(names)
+        lines += [f"Or delete the masks that contradict the others{f' ({more} more)' if more else ''}, and run it again:",
+                  f"    rm {' '.join(names)}"]  # fmt: skip
+    return lines
+
+
+def _size(masks: Path) -> tuple[int, int] | None:
+    """Return the median width and height of the box about the objects in the masks that show them; None without."""
+    from beags_plugin.labels.classes import read_id_mask
+
+    boxes = []
+    for path in sorted(masks.rglob("*.png")):
+        labels = read_id_mask(path)
+        rows, columns = np.nonzero((labels != BACKGROUND) & (labels != IGNORE))
+        if len(rows):
+            boxes.append((np.ptp(columns) + 1, np.ptp(rows) + 1))
+    return None if not boxes else tuple(int(side) for side in np.median(boxes, axis=0))  # pyright: ignore[reportReturnType]
+
+
+def write_doubt(run: Path, path: Path) -> bool:
+    """Write a picture of the views whose masks changed most; return whether there is one, else remove an old one."""
+    from beags_plugin.pictures.masks import Changed, before_and_after
+    from beags_plugin.plugin.runs.place import open_run
+    from beags_plugin.plugin.runs.prepared import training_masks
+    from beags_plugin.system.reading.images import read_image
+
+    agreement = _json(run / "prepared/report.json").get("agreement") or {"views": []}
+    moved = {each["view"]: each["changed"] + each["doubtful"] for each in agreement["views"]}
+    worst = sorted((name for name in moved if moved[name] > 0), key=lambda name: -moved[name])[:PICTURES]
+    if not worst:
+        path.unlink(missing_ok=True)
+        return False
+    views = {each.name: each for each in training_masks(open_run(run / "config.yml"))}
+    shown = []
+    for name in worst:
+        view = views[name]
+        height, width = view.used.shape
+        photo = read_image(view.photo, lambda image, size=(width, height): np.array(image.convert("RGB").resize(size)))
+        changed = np.zeros(view.used.shape, bool) if view.given is None else view.given != view.used
+        grey = np.where(view.used == IGNORE, 0, np.where(changed, 128, 255)).astype(np.uint8)
+        shown.append(Changed(name, photo, view.given, view.used, grey))
+    before_and_after(path, shown, "black: in doubt, grey: changed")
+    return True
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}

@@ -1,0 +1,94 @@
+"""What beags demo says at its end about how sure it is, and where --strict stops it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from data_folders import write_image
+from run_folders import write_scene
+
+from beags_plugin.commands import demo
+from beags_plugin.commands.certainty import certainty
+from beags_plugin.commands.made_masks import MADE, as_made
+from beags_plugin.commands.made_scene import MadeScene
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.classes import write_mask
+from beags_plugin.masks.check.contradictions import Contradiction
+from beags_plugin.plugin.objects import check_masks
+from beags_plugin.system.digests import folder_digest
+from beags_plugin.system.errors import UserError
+
+
+def write_run(folder: Path, agreement: float | None, overruled: list[str]) -> Path:
+    """Write what certainty reads of a run: its report, and masks of an object of 40 x 20 pixels."""
+    (folder / "prepared/masks").mkdir(parents=True)
+    report = {"agreement": agreement, "masks": 20, "overruled": overruled, "doubtful": 0.004, "views": []}
+    (folder / "prepared/report.json").write_text(json.dumps({} if agreement is None else {"agreement": report}))
+    mask = np.zeros((60, 80), np.uint16)
+    mask[10:30, 5:45] = 1
+    mask[50:] = IGNORE
+    write_mask(folder / "prepared/masks/a.png", mask)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("agreement", "overruled", "level"),
+    [(0.97, [], "sure"), (0.97, ["a"], "fairly sure"), (0.8, [], "fairly sure"), (0.7, [], "not sure"),
+     (0.95, ["a", "b", "c"], "not sure"), (None, [], "not judged")],
+)  # fmt: skip
+def test_the_words_follow_from_what_the_masks_agree_on(tmp_path, agreement, overruled, level):
+    found = certainty(write_run(tmp_path / "run", agreement, overruled), tmp_path)
+    assert found.level == level and found.to_json()["level"] == level
+    said = " ".join(found.lines)
+    assert (f"How sure: {level}" in said) == (agreement is not None)
+    assert ("ns-viewer --load-config" in said) == (level in ("fairly sure", "not sure"))
+    assert "40 x 20 pixels" in said and "--downscale 1" in said
+    assert found.figures["object pixels"] == [40, 20]
+
+
+def test_photos_without_poses_and_masks_to_delete_are_named(tmp_path):
+    (tmp_path / "poses.json").write_text(json.dumps({"photos": 30, "registered": 26}))
+    overruled = [f"v {index}" for index in range(8)]
+    lines = certainty(write_run(tmp_path / "run", 0.6, overruled), tmp_path, tmp_path / "masks").lines
+    assert "4 of 30 photos have no pose and were left out." in lines
+    assert "8 of 20 masks were overruled" in " ".join(lines)
+    (command,) = [line for line in lines if line.startswith("    rm ")]
+    assert command.count(".png'") == 6 and f"'{tmp_path}/masks/v 0.png'" in command
+    assert any("(2 more)" in line for line in lines)
+
+
+def test_masks_that_a_network_made_are_made_to_agree_and_those_that_were_mended_are_not(tmp_path, monkeypatch):
+    data, words = write_scene(tmp_path / "data"), []
+    monkeypatch.setattr(demo, "_finish", words.extend)
+    scene = MadeScene(data)
+
+    def agrees(photos: str = "all") -> bool:
+        words.clear()
+        demo.train(scene, tmp_path / "run", "beags-tiny", 1.0, photos)
+        return "--pipeline.model.prepare.agree" in words
+
+    assert not agrees()  # the user's own
+    (data / MADE).write_text(json.dumps({"photos": "", "masks": folder_digest(data / "masks")}))
+    assert as_made(data) and agrees() and not agrees("objects")
+    write_image(data / "masks/v03.png", np.zeros((12, 16), np.uint8))
+    assert not agrees()
+
+
+def test_strict_stops_before_training_where_masks_contradict(tmp_path, monkeypatch):
+    data = write_scene(tmp_path / "data")
+    contradiction = Contradiction("v03", 1, 5, 0, 10, "points")
+    report = SimpleNamespace(contradictions=[contradiction])
+    monkeypatch.setattr(check_masks, "check_scene", lambda _: report)
+    monkeypatch.setattr(check_masks, "write_contradictions", lambda _, output: [output / "contradicted.png"])
+    with pytest.raises(UserError, match=r"1 masks contradict the others \(v03; see .*contradicted.png\)"):
+        demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, False, True)
+    assert not (tmp_path / "out/run").exists()
+    monkeypatch.setattr(demo, "_train_once", lambda *_: None)
+    monkeypatch.setattr(demo, "measure", lambda *_: None)
+    demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, False)
+    report.contradictions.clear()
+    demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, False, True)
