@@ -52,7 +52,7 @@ def certainty(run: Path, scene: Path, masks: Path | None = None) -> Certainty:
         figures["object pixels"] = list(size)
         finer = ": for more detail, add --downscale 1" if max(size) < SMALL else ""
         lines.append(f"The object has about {size[0]} x {size[1]} pixels in the photos as they were trained on{finer}.")
-    if level in ("fairly sure", "not sure"):
+    if agreement is not None and level != "sure":
         lines += _next(run, agreement, masks)
     return Certainty(level, lines, figures)
 
@@ -72,13 +72,13 @@ def _of_masks(level: str, agreement: dict[str, Any]) -> str:
 
 
 def _next(run: Path, agreement: dict[str, Any], masks: Path | None) -> list[str]:
-    config = run / "base" / "config.yml"
     lines = ["If the object is not what you meant, pick it by a few clicks, and press Save as masks:",
-             f"    ns-viewer --load-config {quoted(config)}"]  # fmt: skip
+             f"    beags view {quoted(run / 'base')}"]  # fmt: skip
     if masks is not None and agreement["overruled"]:
         names = [quoted(masks / f"{name}.png") for name in agreement["overruled"][:NAMED]]
         more = len(agreement["overruled"]) - len(names)
-        lines += [f"Or delete the masks that contradict the others{f' ({more} more)' if more else ''}, and run it again:",
+        others = f" ({more} more)" if more else ""
+        lines += [f"Or delete the masks that contradict the others{others}, and run it again:",
                   f"    rm {' '.join(names)}"]  # fmt: skip
     return lines
 

@@ -88,10 +88,10 @@ def check_contradictions(scene: MadeScene, output: Path) -> None:
 
     output: of the demo, which gets contradicted.png.
     """
-    from beags_plugin.plugin.objects.check_masks import check_scene, data_options, write_contradictions
+    from beags_plugin.plugin.objects.check_masks import check_scene, options_beside, write_contradictions
 
-    given = {} if scene.labels is None else {"masks_path": (scene.labels / "masks").absolute()}
-    report = check_scene(data_options(scene.data, **given))
+    masks = None if scene.labels is None else (scene.labels / "masks").absolute()
+    report = check_scene(options_beside(None, scene.data, masks_path=masks))
     views = list(dict.fromkeys(one.view for one in report.contradictions))
     if views:
         picture = write_contradictions(report, output)[0]

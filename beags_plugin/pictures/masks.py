@@ -48,7 +48,10 @@ def overlay(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def before_and_after(path: Path, views: Sequence[Changed], legend: str | None = None) -> None:
-    """Write a picture with a line per view: mask before, mask after, changes, confidence; legend: of its grey values."""
+    """Write a picture with a line per view: mask before, mask after, changes, confidence.
+
+    legend: says what the grey values are, if not the share of the winning votes.
+    """
     lines = []
     for view in views:
         height, width = view.voted.shape

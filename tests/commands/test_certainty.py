@@ -45,7 +45,7 @@ def test_the_words_follow_from_what_the_masks_agree_on(tmp_path, agreement, over
     assert found.level == level and found.to_json()["level"] == level
     said = " ".join(found.lines)
     assert (f"How sure: {level}" in said) == (agreement is not None)
-    assert ("ns-viewer --load-config" in said) == (level in ("fairly sure", "not sure"))
+    assert ("beags view" in said) == (level in ("fairly sure", "not sure"))
     assert "40 x 20 pixels" in said and "--downscale 1" in said
     assert found.figures["object pixels"] == [40, 20]
 

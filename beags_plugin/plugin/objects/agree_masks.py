@@ -66,15 +66,19 @@ def agree_masks(config_path: Path, options: ReprojectionOptions, output: Path | 
             write_mask(output / "masks" / path, files.as_in_file(labels[index].numpy().astype(np.uint16), index))
         (output / "classes.json").write_text(json.dumps({str(i): name for i, name in classes.items()}, indent=1))
         (output / "report.json").write_text(json.dumps(report.to_json(names), indent=1))
-        order = sorted(range(len(views)), key=lambda view: -(report.changed[view] + report.doubtful[view]))[:PICTURES]
+        touched = np.add(report.changed, report.doubtful)
+        order = [int(view) for view in np.argsort(-touched, kind="stable")[:PICTURES] if touched[view] > 0]
         pictured = []
         for view in order:
             before = given[view]
             before = None if before is None else before.numpy()
             pictured.append(Changed(names[view], pixels(view), before, labels[view].numpy(), shown[view].numpy()))
-        before_and_after(output / "doubt.png", pictured, LEGEND)
-    return [f"{report.sentence(names)}.", *(str(output / name) for name in ("masks", "report.json", "doubt.png")),
-            f"Next: {_refinement(scene, output.absolute())}"]  # fmt: skip
+        (output / "doubt.png").unlink(missing_ok=True)
+        if pictured:
+            before_and_after(output / "doubt.png", pictured, LEGEND)
+    written = ("masks", "report.json", *(["doubt.png"] if pictured else []))
+    said = [f"{report.sentence(names)}.", *(str(output / name) for name in written)]
+    return [*said, f"Next: {_refinement(scene, output.absolute())}"]
 
 
 def _downscale(scene: SavedScene) -> float:
