@@ -15,11 +15,11 @@ from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.picking.agreement import AgreedMask
 from beags_plugin.pictures.masks import Changed, before_and_after
 from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
-from beags_plugin.plugin.runs.read import SavedScene, raster_settings, read_run
-from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+from beags_plugin.plugin.runs.read import SavedScene
+from beags_plugin.plugin.runs.run import Run
+from beags_plugin.plugin.views.data_options import DataOptions
 from beags_plugin.preparation.agreed import agree
 from beags_plugin.preparation.pipeline import check_masks, known_classes
-from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.system.errors import writing
 from beags_plugin.system.pasted import command, quoted
 from beags_plugin.system.progress import counted, progress_bar
@@ -37,8 +37,8 @@ def agree_masks(config_path: Path, options: ReprojectionOptions, output: Path | 
     not used. output: the folder; ``agreed`` beside config.yml if None. Raises ``UserError`` for a run or data that
     cannot be used, and if no mask of a training view names an object.
     """
-    scene = read_run(config_path, options.data)
-    manager = data_to_reproject(scene, config_path, options)
+    run = Run(config_path, options.data)
+    scene, manager = run.scene, data_to_reproject(run, options)
     views, files = manager.views("train"), manager.files["train"]
     with progress_bar("Reading masks", passing=True) as progress:
         given = LabelMaps(view.labels for view in counted(views, len(views), progress))
@@ -55,7 +55,7 @@ def agree_masks(config_path: Path, options: ReprojectionOptions, output: Path | 
 
     labels, report = agree(
         scene.surfels().detach(), [view.camera for view in views], given, known_classes(given, classes),
-        make_rasterizer(scene.config.model_config.rasterizer), raster_settings(scene), progress_bar,
+        run.rasterizer, run.settings, progress_bar,
         1 if options.run_size else max(1, round(_downscale(scene))),
         [partial(pixels, view) for view in range(len(views))], take,
     )  # fmt: skip
@@ -84,7 +84,7 @@ def agree_masks(config_path: Path, options: ReprojectionOptions, output: Path | 
 def _downscale(scene: SavedScene) -> float:
     """Return how much larger the photos are than what the run was trained on."""
     data = scene.config.data_config
-    parser = cast(BeagsDataParserConfig, data.dataparser)
+    parser = cast(DataOptions, data.dataparser)
     return (parser.downscale_factor or 1.0) / data.camera_res_scale_factor
 
 

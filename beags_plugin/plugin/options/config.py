@@ -154,8 +154,8 @@ class BeagsTrainerConfig(TrainerConfig):
         goes_on = loaded is not None and Path(loaded).resolve().parent == run.resolve()
         if saved and not (goes_on or self.overwrite):
             raise UserError(
-                f"{run} holds a run: go on with it (beags resume {quoted(run)}), replace it (--overwrite), or choose "
-                "another --run-dir."
+                f"{run} holds a run: go on with it (beags resume {quoted(run)}), replace it (--overwrite True), or "
+                "choose another --run-dir."
             )
         self.overwrite = False  # saved, it would hold for every later ns-train --load-config too
 

@@ -15,7 +15,7 @@ from beags_plugin.plugin.options.config import base_config
 from beags_plugin.plugin.options.machine import default_device
 from beags_plugin.plugin.runs.checkpoint_file import model_state, read_checkpoint
 from beags_plugin.plugin.runs.layout import newest_checkpoint
-from beags_plugin.plugin.runs.place import check_data, open_run
+from beags_plugin.plugin.runs.place import check_data, open_for_training
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.options.config import BeagsTrainerConfig
@@ -28,7 +28,7 @@ def viewed_pipeline(config_path: Path, data: Path | None = None) -> tuple[BeagsT
 
     data: the photos, if not where the run was trained on them. Raises ``UserError``.
     """
-    config = open_run(config_path, data)
+    config = open_for_training(config_path, data)
     check_data(config.data_path, config_path)
     ours = base_config()
     config.pipeline._target, config.model_config._target = ours.pipeline._target, ours.model_config._target

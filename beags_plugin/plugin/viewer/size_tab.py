@@ -12,6 +12,7 @@ from beags_plugin.export.frames import Frame
 from beags_plugin.export.pose_options import PoseOptions
 from beags_plugin.plugin.objects.pose import metres_per_unit
 from beags_plugin.plugin.runs.read import read_transform
+from beags_plugin.plugin.runs.run import Run
 from beags_plugin.plugin.viewer.clicks import SceneClicks
 from beags_plugin.plugin.viewer.legend import capitalised, escaped
 from beags_plugin.plugin.viewer.measure import Measure, place_under
@@ -116,7 +117,7 @@ class SizeTab:
             text = self.scale_by()
             length = PoseOptions(scale_by=text).length()
             assert length is not None and self.viewing.run is not None
-            metres = metres_per_unit(length, self.viewing.run.folder / "config.yml", self._world())
+            metres = metres_per_unit(length, Run(self.viewing.run.folder / "config.yml"), self._world())
         except UserError as error:
             return escaped(capitalised(error))
         said = f"A unit of the input is {metres:.4g} m. What is exported here is in metres, stl and 3mf in millimetres."

@@ -14,7 +14,7 @@ pytest.importorskip("nerfstudio")
 
 from beags_plugin.commands import cli
 from beags_plugin.plugin.options.config import config_text
-from beags_plugin.plugin.runs.place import open_run
+from beags_plugin.plugin.runs.place import open_for_training
 from beags_plugin.plugin.viewer import serve
 from beags_plugin.system.errors import UserError
 
@@ -41,7 +41,7 @@ def run(trained, tmp_path) -> Path:
 
 
 def test_a_foreign_run_is_shown_on_this_computer_alone(run, monkeypatch):
-    config = open_run(run / "config.yml")
+    config = open_for_training(run / "config.yml")
     config.viewer.websocket_host, config.viewer.make_share_url, config.vis = "0.0.0.0", True, "viewer_legacy"
     config.pipeline._target = torch.nn.Identity  # something else than our pipeline
     (run / "config.yml").write_text(config_text(config).replace("torch.nn.modules.linear", "torch.optim.sgd"))
