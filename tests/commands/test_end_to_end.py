@@ -225,14 +225,15 @@ def test_a_trained_scene_is_rendered_whole_cropped_and_by_object(trained):
     assert float(model.get_outputs_for_camera(camera, obb_box=box)["accumulation"].sum()) == 0.0
 
 
-def test_demo_on_a_folder_writes_table_figures_and_picture(trained, tmp_path, monkeypatch):
+def test_demo_on_a_folder_writes_table_figures_and_picture(trained, data, tmp_path, monkeypatch):
     """The measuring half of the demo, on the run that is there."""
     from beags_plugin.commands.demo import measure
+    from beags_plugin.commands.made_scene import MadeScene
 
     folder, _ = trained
-    measure(folder, tmp_path, {})
+    measure(folder, tmp_path, {}, MadeScene(data))
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert set(summary) == {"mean", "objects", "psnr", "seconds", "peak_memory_mb"}
+    assert set(summary) == {"mean", "objects", "psnr", "seconds", "peak_memory_mb", "certainty"}
     for kind in ("extracted", "rendered"):
         for stage in ("assigned", "refined"):
             assert all(0.0 <= summary["mean"][kind][stage][name] <= 1.0 for name in ("acc", "iou", "biou"))
