@@ -45,7 +45,10 @@ SENTENCES = {
     "resume {tmp}/notes.yml": "{tmp}/notes.yml is not a run of ns-train beags: name the config.yml of one.",
     "resume {tmp}/run": "{tmp}/run holds a scene without the state of its training: resume the run that it comes from, "
     "or refine it: ns-train beags-refine --load-dir {tmp}/run/nerfstudio_models.",
+    # view
+    "view {tmp}/absent.yml": NO_FILE,
     # masks
+    "masks agree --load-config {tmp}/absent.yml": NO_FILE,
     "masks truth --data {tmp}/lab": "give one of --nvos and --spin-nerf the folder of the downloaded masks.",
     "masks check": "no scene is named: give --data its folder, or --load-config a run trained on it.",
     "masks check --data {tmp}/nowhere": NO_DATA,
@@ -92,8 +95,8 @@ SENTENCES = {
     f"export --load-config {RUN} --object cup --format stl": "a .stl file is in millimetres, but the size of the "
     'scene is not known: give a length with --scale-by, such as "frame_0012:340,215 frame_0012:512,220 12 cm".',
     f"export --load-config {RUN} --object cup --frame moon": "there is no frame 'moon': choose one of world, object.",
-    f"export --load-config {RUN} --object cup --format glb --resolution 0": "resolution is 0: give 8 to 4096 voxels "
-    "along the longest side.",
+    f"export --load-config {RUN} --object cup --format glb --resolution 7": "resolution is 7: give 8 to 4096 voxels "
+    "along the longest side, or 0.",
     f"export --load-config {RUN} --object cup --json {{tmp}}/file/x.json": "{tmp}/file/x.json cannot be written (File "
     "exists): choose another place.",
     # render
@@ -180,5 +183,5 @@ def test_subcommands_read_alike():
             kinds.setdefault(field.name, set()).add(str(field.type))
     assert kinds["json"] == {"Path | None"} and kinds["object"] == {"tuple[str, ...]"}
     assert kinds["load_config"] == {"Path", "tuple[Path, ...]"}  # eval takes several
-    assert kinds["output"] <= {"Path", "Path | None"}
+    assert kinds["output"] <= {"Annotated[Path, OUTPUT]", "Annotated[Path | None, OUTPUT]"}
     assert not {"run", "config", "config_path", "objects", "out", "out_dir"} & set(kinds)

@@ -16,7 +16,7 @@ from beags_plugin.labels.classes import palette_of, read_mask
 from beags_plugin.labels.id_checks import check_ids, check_palettes
 from beags_plugin.masks.check.issues import STOPS, Issue, named, percent
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.pasted import quoted
+from beags_plugin.system.pasted import command
 
 FEW_VIEWS = 3  # an object needs two other views to outvote one
 MOST_IDS = 256  # in one file, or compared between views, with memory of their square
@@ -169,8 +169,8 @@ def _no_id_image(files: MaskFiles, view: int, ids: int) -> Issue:
 
 def _make(files: MaskFiles) -> str:
     """Return the command that makes masks of what stands out in a scene's photos."""
-    scene = quoted(files.folder.parent) if files.folder.name == "masks" else "SCENE"
-    return f"beags masks make --data {scene} --source salient"
+    scene = files.folder.parent if files.folder.name == "masks" else "SCENE"
+    return command(["beags", "masks", "make", "--data", scene, "--source", "salient"])
 
 
 def _missing(files: MaskFiles) -> Iterator[Issue]:
