@@ -174,7 +174,7 @@ class BeagsTrainerConfig(TrainerConfig):
             run_lock(self.get_base_dir()).release()
 
 
-def _read_by_nerfstudio(loader: yaml.Loader, node: yaml.Node) -> Iterator[BeagsTrainerConfig]:
+def _read_by_nerfstudio(loader: yaml.constructor.SafeConstructor, node: yaml.Node) -> Iterator[BeagsTrainerConfig]:
     """Build a config that an ns-* command reads, in the place where its run lies now."""
     config = BeagsTrainerConfig.__new__(BeagsTrainerConfig)
     yield config

@@ -69,6 +69,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         }  # fmt: skip
         self.train_cameras = self.train_dataset.cameras.to(self.device)
         self._cameras: dict[int, Camera] = {}
+        _ = self.cached_train  # Photos are read now, so that what is wrong with one is said before all else.
         self.close_ups: CloseUps | None = None  # that training sees, once ``focus`` was called
         self._present: list[list[int]] | None = None  # objects of each training view's labels, once they are replaced
         # nerfstudio samples evaluation views by Python's global generator, which others use too.

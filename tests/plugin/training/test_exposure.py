@@ -324,7 +324,7 @@ def test_textures_and_exports_get_photos_of_the_mean_exposure(whole):
         (affine,) = (
             own for own, known in zip(scene.exposures.affine, scene.exposures.names, strict=True) if known == name
         )
-        photo, evened = shown.photos[view].image, _image(shown, view)
+        photo, evened = shown.photos[view].image, _image(shown, view, (slice(None), slice(None)))
         inside = ((evened > 0) & (evened < 1)).all(dim=-1)
         assert inside.float().mean() > 0.5 and (photo - evened).abs().max() > 0.01
         assert torch.allclose(apply_affine(evened, affine)[inside], photo[inside], atol=1e-4)
@@ -334,14 +334,14 @@ def test_burnt_out_pixels_are_no_colours_of_a_surface(whole):
     """Evened, the white of a bright photo would be a grey that no surface has."""
     scene = read_run(whole / "config.yml")
     shown = shown_scene(Run(whole / "config.yml"))
-    images = [view.image.clone() for view in shown.photos]
+    part, images = scene.surfels().detach(), [view.image.clone() for view in shown.photos]
     images[2][5:9, 3:6] = 1.0
     burnt = [(image == 1.0).all(dim=2) for image in images]
     assert burnt[2].sum() >= 12
     for exposures in (shown.exposures, None):
         scene = replace(shown, exposures=exposures)
         vars(scene)["photos"] = [SimpleNamespace(image=image) for image in images]  # which are read only once
-        for view, photo in enumerate(photos_of(scene, None, Frame.of_run())):
+        for view, photo in enumerate(photos_of(scene, None, part, Frame.of_run())):
             expected = ~burnt[view] if exposures is not None else torch.ones_like(burnt[view])
             assert torch.equal(photo.own(), expected)
 

@@ -109,8 +109,8 @@ def test_a_base_is_exported_whole_and_started_from_again(scene, tmp_path, form):
 
     start = write_splatfacto(tmp_path / "a", in_frame(scene.surfels, a_frame(4)), a_frame(4))
     base, report = started(scene, tmp_path / "base", start)
-    base.save_checkpoint(0)
     base.config.save_config()
+    base.save_checkpoint(0)
     outputs = base.pipeline.datamanager.train_dataparser_outputs
     outputs.save_dataparser_transform(tmp_path / "base" / "dataparser_transforms.json")
     config, files = tmp_path / "base" / "config.yml", tmp_path / "files"
