@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.utils.eval_utils import eval_setup
+from nerfstudio.utils.writer import GLOBAL_BUFFER, EventName
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import CameraState
 from nerfstudio.viewer.viewer import Viewer
@@ -62,6 +63,8 @@ class Window:
         return self._drawn(lambda machine, outputs: None, "high")
 
     def _drawn(self, before_sending: Callable, state: str = "low_static") -> dict[str, torch.Tensor]:
+        # The speed that an earlier training in this process has measured would decide the picture's size.
+        GLOBAL_BUFFER.get("events", {}).pop(EventName.VIS_RAYS_PER_SEC.value, None)
         machine = RenderStateMachine(self.viewer, 10.0, self.client)
         machine.state = state
         found: list = []
