@@ -12,7 +12,7 @@ import numpy as np
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.system.pasted import quoted
 
-SURE, FAIR = 0.9, 0.75  # of the agreement between views, from which on the demo is sure, and fairly sure
+SURE, FAIR = 0.9, 0.75  # From such an agreement between views on, the demo is sure, and fairly sure.
 MANY = 0.1  # of the masks: with more overruled as a whole, it is not sure
 NAMED = 6  # photos in a sentence
 SMALL = 150  # pixels: an object whose longer side has fewer shows no print

@@ -31,7 +31,7 @@ from beags_plugin.picking.sight import seen_from
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import draw_features, geometry_inputs
 
-ROUNDS = 4  # of weighing the views, and the votes by them
+ROUNDS = 4  # The views are weighed, and the votes by them, so many times.
 LEAST_ERROR = 0.02  # of the median e: outlines alone make as much, so that it sets no view apart
 SILENT = 0.5  # of e: a mask that is more wrong than right has no say, and is drawn anew from the other views
 CONTRADICTS = 1.5  # of the usual e: a mask that errs less keeps all its pixels, as Gaussians are coarser than photos

@@ -154,7 +154,7 @@ def test_every_reader_of_tensors_refuses_code():
         assert name in allowed or not re.search(r"(?<!`)torch\.load\(", text), name
         own = name == "masks/sources/two_stage.py"  # what it has written itself, to a temporary folder
         assert (own or "np.load(" not in text) and "allow_pickle=True" not in text and "pickle.load" not in text, name
-        read = re.sub(r"yaml\.add_constructor\(.*\)", "", text)  # of what nerfstudio reads
+        read = re.sub(r"yaml\.add_constructor\(.*\)", "", text)  # Nerfstudio itself reads these.
         assert "yaml.Loader" not in read and "yaml.full_load" not in read, name
 
 

@@ -25,7 +25,7 @@ from beags_plugin.plugin.views.held_out_views import HeldOutViews
 
 Progress = Callable[[int, int], None]
 
-_PLAIN_NAMES = ("scene", "turned")  # of the folders that beags demo makes
+_PLAIN_NAMES = ("scene", "turned")  # beags demo calls its folders so.
 
 
 def evaluate_run(

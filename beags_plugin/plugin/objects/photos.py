@@ -16,7 +16,7 @@ from beags_plugin.export.base import Photo
 from beags_plugin.export.frames import Frame, bounding_box
 from beags_plugin.plugin.objects.shown import ShownScene
 
-_AROUND = 0.1  # of the object's box on each side, which a photo shows too
+_AROUND = 0.1  # A crop shows this share of the object's box beside it too.
 _MARGIN = 8  # pixels more
 _KEPT = 200_000_000  # bytes of an object's photos, masks and depths that stay in memory
 

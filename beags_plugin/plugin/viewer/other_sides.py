@@ -16,7 +16,7 @@ from beags_plugin.plugin.viewer.choice import Visible
 from beags_plugin.plugin.viewer.viewing import Paint, Viewing, plain_outputs
 
 SIDES = 4
-_PIXELS = 150  # of each side of a picture
+_PIXELS = 150  # Each side of a picture has as many.
 _MARGIN = 1.6  # around the object, for what the cut has missed
 _GAP = 4  # pixels between two pictures
 _TRIED = 10  # views, of which some see the object behind other things

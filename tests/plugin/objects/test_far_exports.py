@@ -172,7 +172,7 @@ def test_a_start_from_exports_is_exact(far, tmp_path, kind, turned):
         found = torch.cdist(moved.means.double(), expected)
         return float(torch.maximum(found.amin(dim=0).max(), found.amin(dim=1).max()))
 
-    if turned:  # as a program would have written it that takes other axes
+    if turned:  # A program that takes other axes would have written it so.
         if not scene.doubtful_axes:
             return
         quarter = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]], dtype=torch.float64)

@@ -202,7 +202,7 @@ def test_objects_are_picked_saved_refined_and_kept(served):
     refine.data_config.data, refine.load_dir = lab, run / "nerfstudio_models"
     parser = refine.data_config.dataparser
     parser.masks_path, parser.classes_path = saved / "masks", saved / "classes.json"
-    parser.orientation_method, parser.center_method = "none", "none"  # as in the run
+    parser.orientation_method, parser.center_method = "none", "none"  # The run has these too.
     parser.auto_scale_poses, parser.scale_factor = False, 1.0
     refine.machine.device_type = "cpu"
     refine.run_dir = run.parent / "new"

@@ -204,7 +204,7 @@ def test_masks_are_saved_for_training_views_and_never_over_others(opened, capsys
     refine, at = parsed_command(tab.command)
     assert refine["data"] == lab and refine["load_dir"] == config.parent / "nerfstudio_models"
     assert (at.masks_path, at.classes_path) == (picked / "masks", picked / "classes.json")
-    assert at.orientation_method == "none"  # as in the run
+    assert at.orientation_method == "none"  # The run has it too.
     assert json.loads((picked / "classes.json").read_text()) == {"0": "background", "1": "low", "2": "high"}
     files = sorted((picked / "masks").glob("*.png"))
     cameras = {f"v{index}": camera for index, camera in enumerate(views()[3:] + views()[:3])}
