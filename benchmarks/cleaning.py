@@ -38,11 +38,11 @@ class Change:
 def measure(config_path: Path) -> list[Change]:
     """Return what cleaning changes for each object of a run that the held-out views show."""
     from beags_plugin.core.membership import Membership
+    from beags_plugin.core.select import select_class
     from beags_plugin.evaluation.metrics import MaskMetrics
     from beags_plugin.evaluation.run_metrics import evaluate_scene
-    from beags_plugin.extraction.select import select_class
-    from beags_plugin.plugin.objects.clean import cleaner_of
-    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
+    from beags_plugin.objects.clean import cleaner_of
+    from beags_plugin.objects.evaluate import EvaluatedRun
 
     run = EvaluatedRun(config_path)
     scene = run.stages["after"]

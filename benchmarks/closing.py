@@ -22,8 +22,9 @@ import numpy as np
 import torch
 
 from beags_plugin.export import EXPORTERS
-from beags_plugin.export.base import ExportItem
-from beags_plugin.export.mesh import GlbExporter, MadeMesh
+from beags_plugin.export.mesh import GlbExporter
+from beags_plugin.surfaces.item import ExportItem
+from beags_plugin.surfaces.meshing import MadeMesh
 from benchmarks.meshes import Drawn, chamfer, exact_points, is_closed, read_glb
 
 ALL_AROUND = 14  # views of the depth of splats
@@ -52,12 +53,12 @@ class ClosedMesh(GlbExporter):
 
 def measure(config_path: Path, objects: Sequence[str]) -> dict[str, np.ndarray]:
     """Print a row for each object of a run (all, if none is named); return their figures [objects, 4], by kind."""
-    from beags_plugin.export.frames import Frame
-    from beags_plugin.export.mesh_options import MeshOptions
-    from beags_plugin.extraction.ply import read_ply
-    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
-    from beags_plugin.plugin.objects.export import export_run
+    from beags_plugin.objects.evaluate import EvaluatedRun
+    from beags_plugin.objects.export import export_run
     from beags_plugin.sample.families import FAMILIES
+    from beags_plugin.splat_io.ply import read_ply
+    from beags_plugin.surfaces.frames import Frame
+    from beags_plugin.surfaces.mesh_options import MeshOptions
     from beags_plugin.system.reading.ply import read_vertices
 
     run = EvaluatedRun(config_path)

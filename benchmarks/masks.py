@@ -44,7 +44,7 @@ def folder_of(scene: str) -> Iterator[Path]:
 def swaps(data: Path) -> None:
     """Exchange two objects (or the only one and the background) in some views, and look for it."""
     from beags_plugin.masks.check.consistency import LEAST_POINTS, Agreement
-    from beags_plugin.plugin.objects.check_masks import agreement_of, data_options
+    from beags_plugin.objects.check_masks import agreement_of, data_options
 
     labels, classes = agreement_of(data_options(data))
     usable = [view for view in range(labels.shape[1]) if (labels[:, view] >= 0).any()]
@@ -77,7 +77,7 @@ def swaps(data: Path) -> None:
 def parts(data: Path, run: Path | None = None) -> None:
     """Damage an object in one view of four, every second time by ground that is added, and look for these views."""
     from beags_plugin.labels.classes import read_id_mask, write_mask
-    from beags_plugin.plugin.objects.check_masks import check, options_beside
+    from beags_plugin.objects.check_masks import check, options_beside
 
     def checked(masks: Path | None) -> tuple[list[str], dict[str, list[str]]]:
         """Return the training views, and those that each kind of evidence names, the worst first."""

@@ -89,7 +89,7 @@ def read_glb(path: Path) -> Drawn:
     """Read what ``beags export`` wrote, by the standard."""
     from PIL import Image
 
-    from beags_plugin.export.color import srgb_from_linear
+    from beags_plugin.surfaces.color import srgb_from_linear
 
     raw = path.read_bytes()
     length = int.from_bytes(raw[12:16], "little")
@@ -168,9 +168,9 @@ VARIANTS = {"glb": "texture", "glb-colors": "vertex colours", "glb-closed": "tex
 
 def measure(config_path: Path, objects: Sequence[str]) -> None:
     """Print rows of a table for objects of a run, all if none is named."""
-    from beags_plugin.extraction.select import select_class
-    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
-    from beags_plugin.plugin.objects.export import export_run
+    from beags_plugin.core.select import select_class
+    from beags_plugin.objects.evaluate import EvaluatedRun
+    from beags_plugin.objects.export import export_run
     from beags_plugin.sample.families import FAMILIES
 
     EXPORTERS.register("glb-colors", "benchmarks.meshes:VertexColors")
@@ -202,9 +202,9 @@ def measure(config_path: Path, objects: Sequence[str]) -> None:
 
 def measure_one_colour(config_path: Path, objects: Sequence[str]) -> None:
     """Print PSNR of objects' splats in held-out views, as they are and with one colour each."""
+    from beags_plugin.core.select import select_class
     from beags_plugin.export.page_colors import seen_colors
-    from beags_plugin.extraction.select import select_class
-    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
+    from beags_plugin.objects.evaluate import EvaluatedRun
 
     run = EvaluatedRun(config_path)
     scene = run.stages["after"]

@@ -65,8 +65,8 @@ def placed(ids: np.ndarray, class_id: int) -> tuple[Pixels, Pixels]:
 
 def clicks(config_path: Path) -> None:
     """Print a row of a table for a run: mean IoU, and that of each object."""
+    from beags_plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.picking.cutter import Cutter
-    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.system.errors import UserError
 
     run = EvaluatedRun(config_path)
@@ -119,9 +119,9 @@ def owners(run, exact: Sequence[np.ndarray]) -> Tensor:
 
 def growth(config_path: Path) -> None:
     """Print the mean IoU in per cent for each way to change a cut's size; a base without classes will do."""
+    from beags_plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.picking.cutter import Cutter
     from beags_plugin.picking.picks import GROWTH
-    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
 
     run = EvaluatedRun(config_path)
     surfels, cameras, exact = run.stages["after"].surfels(), run.views.cameras("train"), exact_masks(run)

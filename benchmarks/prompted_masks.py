@@ -76,9 +76,9 @@ def refined(base: Path, data: Path, masks: Path, folder: Path, preset: str) -> s
 
     folder: of the runs with these masks; each preset has its own below it.
     """
-    from beags_plugin.plugin.objects.evaluate import evaluate_run
+    from beags_plugin.objects.evaluate import evaluate_run
+    from beags_plugin.plugin.launch import train
     from beags_plugin.plugin.presets import preset_config
-    from beags_plugin.plugin.runs.launch import train
     from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 
     run = folder / preset
@@ -98,9 +98,9 @@ def compare(config_path: Path, output: Path, sources: Sequence[str], preset: str
 
     snap: pixels; see ``make_masks``.
     """
-    from beags_plugin.plugin.objects.make_masks import configured_source, make_masks
-    from beags_plugin.plugin.runs.place import open_run
+    from beags_plugin.objects.make_masks import configured_source, make_masks
     from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+    from beags_plugin.runs.relocation import open_run
     from beags_plugin.system.errors import UserError
 
     data = Path(open_run(config_path).data_path)

@@ -112,7 +112,7 @@ def measure(config_path: Path) -> dict[str, list[WrongMask]]:
 
     from beags_plugin.evaluation.protocol import Protocol
     from beags_plugin.evaluation.run_metrics import MaskRenderer
-    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
+    from beags_plugin.objects.evaluate import EvaluatedRun
 
     run = EvaluatedRun(config_path)
     found: dict[str, list[WrongMask]] = {}

@@ -137,9 +137,9 @@ def plain(options: Any) -> dict[str, Any]:
 def load_views(options: ReprojectionOptions, views: int) -> VotedScene:
     """Return the sample with this number of training views, and the depth of a base trained on it."""
     from beags_plugin.labels.classes import read_id_mask
-    from beags_plugin.plugin.runs.read import raster_settings, read_run, read_transform
     from beags_plugin.rasterizers import make_rasterizer
     from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
+    from beags_plugin.runs.read import raster_settings, read_run, read_transform
     from beags_plugin.sample.writer import make_sample
     from benchmarks.bases import trained_base
 

@@ -18,17 +18,18 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.flattening import flatten
+from beags_plugin.core.select import select_class
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export.base import ExportItem, Viewpoints, make_exporter
+from beags_plugin.export.base import make_exporter
 from beags_plugin.export.page_colors import seen_colors
 from beags_plugin.export.web_page import recording
-from beags_plugin.extraction.select import select_class
 from beags_plugin.importers.base import read_scene
 from beags_plugin.labels.class_ids import BACKGROUND
-from beags_plugin.plugin.objects.evaluate import EvaluatedRun
-from beags_plugin.plugin.runs.run import Run
+from beags_plugin.objects.evaluate import EvaluatedRun
 from beags_plugin.rasterizers.interface import MIN_ALPHA
 from beags_plugin.rasterizers.rendering import surfel_inputs
+from beags_plugin.runs.run import Run
+from beags_plugin.surfaces.item import ExportItem, Viewpoints
 
 SUFFIXES = {"ply": "ply", "compressed-ply": "compressed.ply", "spz": "spz", "splat": "splat", "sog": "sog"}
 

@@ -79,7 +79,7 @@ def write_run_of(count: int, root: Path) -> Path:
     from PIL import Image
 
     from beags_plugin.plugin.options.config import base_config
-    from beags_plugin.plugin.runs.write import write_run
+    from beags_plugin.runs.write import write_run
 
     scene = make_scene(Size(count, 640, 480, 13.0))
     surfels = scene.surfels

@@ -30,9 +30,9 @@ def write_data(root: Path, views: int) -> None:
     import cv2
 
     from beags_plugin.core.cameras import Camera
-    from beags_plugin.extraction.ply import write_ply
     from beags_plugin.rasterizers import make_rasterizer
     from beags_plugin.rasterizers.rendering import render_class_map, surfel_inputs
+    from beags_plugin.splat_io.ply import write_ply
     from benchmarks.scaling_scene import SETTINGS, Sizes, make_scene
 
     rasterizer = make_rasterizer("auto")

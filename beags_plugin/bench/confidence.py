@@ -19,7 +19,7 @@ from beags_plugin.labels.colors import colorize
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from beags_plugin.plugin.runs.prepared import TrainingMasks
+    from beags_plugin.runs.prepared import TrainingMasks
 
 SHOWN_DAMAGE = 2.0  # the degree that is shown, or the one nearest to it
 VIEWS = 2  # of each scene: the view that changed most, and one that had no mask
@@ -54,8 +54,8 @@ def shown_runs(runs: Sequence[VariantTrial], outcomes: Mapping[str, Outcome]) ->
 
 
 def _views(run: VariantTrial, outcomes: Mapping[str, Outcome]) -> list[TrainingMasks]:
-    from beags_plugin.plugin.runs.place import open_run
-    from beags_plugin.plugin.runs.prepared import training_masks
+    from beags_plugin.runs.prepared import training_masks
+    from beags_plugin.runs.relocation import open_run
 
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
         views = training_masks(open_run(outcomes[run.trial.digest].folder / "run/config.yml"))

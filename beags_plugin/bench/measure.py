@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from beags_plugin.labels.class_ids import IGNORE
 
 if TYPE_CHECKING:
-    from beags_plugin.plugin.runs.prepared import TrainingMasks
+    from beags_plugin.runs.prepared import TrainingMasks
 
 
 def measure_run(config_path: Path) -> dict[str, Any]:
@@ -18,9 +18,9 @@ def measure_run(config_path: Path) -> dict[str, Any]:
     evaluation: ``RunMetrics.to_json`` without its single views. Its "before" is the base with the classes of
     this run, which is the result of assignment alone. mask_error_...: see ``mask_error``.
     """
-    from beags_plugin.plugin.objects.evaluate import evaluate_run
-    from beags_plugin.plugin.runs.place import open_run
-    from beags_plugin.plugin.runs.prepared import training_masks
+    from beags_plugin.objects.evaluate import evaluate_run
+    from beags_plugin.runs.prepared import training_masks
+    from beags_plugin.runs.relocation import open_run
 
     found = evaluate_run(config_path).to_json()
     evaluation = {name: value for name, value in found.items() if name != "views"}

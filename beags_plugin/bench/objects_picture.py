@@ -16,7 +16,7 @@ from beags_plugin.bench.trials import OPTIONS, Trial, VariantTrial
 
 if TYPE_CHECKING:
     from beags_plugin.evaluation.records import EvalView
-    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
+    from beags_plugin.objects.evaluate import EvaluatedRun
 
 _SIDE = 150  # pixels of a cell
 _LETTERS = 26  # of a caption in a cell
@@ -63,10 +63,10 @@ def _objects(
     scene: str, runs: Sequence[VariantTrial], outcomes: Mapping[str, Outcome], most: int
 ) -> list[list[np.ndarray]]:
     """Return the cells of the ``most`` largest objects of a scene, each with its photo first."""
+    from beags_plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.pictures.cells import cell, crop, square_around
     from beags_plugin.pictures.contact_sheet import alone, cut_out
-    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
-    from beags_plugin.plugin.runs.read import read_run
+    from beags_plugin.runs.read import read_run
 
     done = [trial for run in runs for trial in run.trials if outcomes[trial.digest].failed is None]
     if not done:

@@ -170,7 +170,7 @@ def class_masks(scene: TrialScene, count: int, folder: Path, write: bool = True)
     from sklearn.cluster import KMeans
 
     from beags_plugin.core.lifting import project
-    from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+    from beags_plugin.views.cameras import camera_from_nerfstudio
 
     code = Path(__file__).read_text("utf8")
     target = folder / f"classes-{value_digest([scene.digest, count, code])[:12]}"

@@ -63,9 +63,9 @@ def _import_everything() -> None:
     from nerfstudio.scripts import train  # noqa: F401
 
     from beags_plugin.bench import measure  # noqa: F401
+    from beags_plugin.objects import evaluate, extract  # noqa: F401
     from beags_plugin.ops import extension
     from beags_plugin.plugin import presets  # noqa: F401
-    from beags_plugin.plugin.objects import evaluate, extract  # noqa: F401
 
     extension.load()
 
@@ -130,11 +130,11 @@ def train_trial(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
     refiners a figure of their own, as "labelled_share".
     """
     from beags_plugin.data.files import image_size
-    from beags_plugin.plugin.runs.checkpoint_file import read_checkpoint
-    from beags_plugin.plugin.runs.launch import resume, train
-    from beags_plugin.plugin.runs.layout import REPORT_FILE, newest_checkpoint
-    from beags_plugin.plugin.runs.prepared import grid_state
+    from beags_plugin.plugin.launch import resume, train
     from beags_plugin.refiners import make_refiner
+    from beags_plugin.runs.checkpoint_file import read_checkpoint
+    from beags_plugin.runs.layout import REPORT_FILE, newest_checkpoint
+    from beags_plugin.runs.prepared import grid_state
     from beags_plugin.system.memory import peak_memory_mb
 
     start_memory_mb = peak_memory_mb()

@@ -99,8 +99,8 @@ def _size(masks: Path) -> tuple[int, int] | None:
 def write_doubt(run: Path, path: Path) -> bool:
     """Write a picture of the views whose masks changed most; return whether there is one, else remove an old one."""
     from beags_plugin.pictures.masks import Changed, before_and_after
-    from beags_plugin.plugin.runs.place import open_run
-    from beags_plugin.plugin.runs.prepared import training_masks
+    from beags_plugin.runs.prepared import training_masks
+    from beags_plugin.runs.relocation import open_run
     from beags_plugin.system.reading.images import read_image
 
     agreement = _json(run / "prepared/report.json").get("agreement") or {"views": []}

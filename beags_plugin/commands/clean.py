@@ -20,7 +20,7 @@ from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
 if TYPE_CHECKING:
-    from beags_plugin.commands.made_scene import MadeScene
+    from beags_plugin.commands.scene_setup import MadeScene
     from beags_plugin.evaluation.report import RunMetrics
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
@@ -42,10 +42,10 @@ def clean_scene(
     steps: of refinement, the preset's if None. overwrite: replace a scene that was cleaned there before. Raises
     ``UserError``.
     """
-    from beags_plugin.commands.made_scene import made_scene
+    from beags_plugin.commands.scene_setup import made_scene
     from beags_plugin.importers.base import read_scene
-    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
-    from beags_plugin.plugin.objects.written_back import changes, format_of, write_back
+    from beags_plugin.objects.evaluate import EvaluatedRun
+    from beags_plugin.objects.written_back import changes, format_of, write_back
 
     if polish < 0 or (steps is not None and steps < 1):
         raise UserError("--polish is 0 or more, and --steps 1 or more.")

@@ -19,10 +19,10 @@ from beags_plugin.commands.process import Process
 from beags_plugin.commands.starting import check_arguments, starting
 from beags_plugin.commands.view import View
 from beags_plugin.evaluation.protocol import Protocol
-from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.export.pose_options import PoseOptions
 from beags_plugin.export.splat_options import SplatOptions
 from beags_plugin.pictures.options import RenderOptions
+from beags_plugin.surfaces.mesh_options import MeshOptions
 from beags_plugin.system.errors import UserError, refused, silence_libraries
 from beags_plugin.system.output_option import OUTPUT
 from beags_plugin.system.pasted import quoted
@@ -78,7 +78,7 @@ class Resume:
 
     def run(self) -> None:
         with starting(self):
-            from beags_plugin.plugin.runs.launch import resume
+            from beags_plugin.plugin.launch import resume
         try:
             resume(self.run_folder, self.device, self.check_memory, self.data)
         except KeyboardInterrupt:
@@ -146,7 +146,7 @@ class Extract:
 
     def run(self) -> None:
         with starting(self):
-            from beags_plugin.plugin.objects.extract import extract_objects
+            from beags_plugin.objects.extract import extract_objects
         sentences: list[str] = []
         with progress_bar("extracting") as progress:
             extracted = extract_objects(
@@ -200,7 +200,7 @@ class Export:
 
     def run(self) -> None:
         with starting(self):
-            from beags_plugin.plugin.objects.export import export_run
+            from beags_plugin.objects.export import export_run
         options = {name: asdict(self.mesh) for name in ("glb", "gltf-both", "usdz", "obj", "stl", "3mf")}
         options |= self.splats.of_formats(self.mesh)
         sentences: list[str] = []
@@ -274,7 +274,7 @@ class Render:
             self._underlay()
             return
         with starting(self):
-            from beags_plugin.plugin.objects.render import render_run
+            from beags_plugin.objects.render import render_run
         with progress_bar("rendering") as progress:
             path = render_run(
                 self.load_config, self.object, self.format, self.output, self.pictures, progress, self.data
@@ -288,7 +288,7 @@ class Render:
                 "than --load-config, --object, --output and --data."
             )
         with starting(self):
-            from beags_plugin.plugin.objects.underlay import write_underlays
+            from beags_plugin.objects.underlay import write_underlays
         with progress_bar("rendering") as progress:
             made = write_underlays(self.load_config, self.object, self.output, progress, self.data)
         CONSOLE.print(

@@ -25,7 +25,7 @@ from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
 if TYPE_CHECKING:
-    from beags_plugin.commands.made_scene import MadeScene
+    from beags_plugin.commands.scene_setup import MadeScene
     from beags_plugin.plugin.options.model_options import BeagsModelConfig
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
@@ -42,10 +42,10 @@ def run_demo(
     strict: bool = False,
 ) -> None:  # fmt: skip
     """Run the whole demo in ``output`` and print the table; see ``cli.Demo`` for the arguments."""
-    from beags_plugin.commands.made_scene import MadeScene, made_scene, name_of
+    from beags_plugin.commands.scene_setup import MadeScene, made_scene, name_of
     from beags_plugin.data.layout import read_dataset
     from beags_plugin.data.quick import quick_downscale
-    from beags_plugin.plugin.runs.prepared import photos_contradict
+    from beags_plugin.runs.prepared import photos_contradict
     from beags_plugin.sample.writer import make_sample
 
     preset = preset or (PRESET if data is None else PRESET_OF_PHOTOS)
@@ -88,7 +88,7 @@ def check_contradictions(scene: MadeScene, output: Path) -> None:
 
     output: of the demo, which gets contradicted.png.
     """
-    from beags_plugin.plugin.objects.check_masks import check_scene, options_beside, write_contradictions
+    from beags_plugin.objects.check_masks import check_scene, options_beside, write_contradictions
 
     masks = None if scene.labels is None else (scene.labels / "masks").absolute()
     report = check_scene(options_beside(None, scene.data, masks_path=masks))
@@ -212,10 +212,10 @@ def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene
     """Compare assignment alone with refinement, extract every object, write summary.json and the pictures."""
     from beags_plugin.commands.certainty import certainty, write_doubt
     from beags_plugin.evaluation.table import render_run, summary_json
+    from beags_plugin.objects.evaluate import EvaluatedRun
+    from beags_plugin.objects.extract import extract_objects
     from beags_plugin.pictures.cells import write_picture
     from beags_plugin.pictures.contact_sheet import contact_sheet, draw_rows, novel_camera
-    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
-    from beags_plugin.plugin.objects.extract import extract_objects
 
     with timed(seconds, "evaluation"), progress_bar("Evaluating") as progress:
         evaluated = EvaluatedRun(run / "config.yml")

@@ -52,9 +52,9 @@ def run_evaluation(
     """
     from beags_plugin.evaluation.report import CSV_COLUMNS, data_set
     from beags_plugin.evaluation.table import render_data_set, render_run
+    from beags_plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.pictures.cells import write_picture
     from beags_plugin.pictures.worst_views import worst_views_picture
-    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
 
     protocol.check()
     outputs.check()
@@ -89,8 +89,8 @@ def scene_names(configs: Sequence[Path]) -> list[str]:
 
     Raises ``UserError`` for a file that is no run's config, and for a run given twice.
     """
-    from beags_plugin.plugin.objects.evaluate import scene_name
-    from beags_plugin.plugin.runs.place import open_run
+    from beags_plugin.objects.evaluate import scene_name
+    from beags_plugin.runs.relocation import open_run
 
     if not configs:
         raise UserError("no run is named: give --load-config the config.yml of at least one.")

@@ -35,9 +35,9 @@ def made_masks(scene: Path, folder: Path) -> Path | None:
     scene: or a folder of photos, without poses. What an earlier call made is taken as it is.
     """
     from beags_plugin.masks.sources.salient import SalientSource
-    from beags_plugin.plugin.objects.make_masks import make_masks
-    from beags_plugin.plugin.views.data_options import DataOptions
-    from beags_plugin.plugin.views.scene_data import SceneData
+    from beags_plugin.objects.make_masks import make_masks
+    from beags_plugin.views.data_options import DataOptions
+    from beags_plugin.views.scene_data import SceneData
 
     config = DataOptions(data=scene)
     images = SceneData(config).posed_views()[1].images if fitting_layouts(scene) else list_photos(scene)

@@ -48,7 +48,7 @@ class Check:
         if self.data is None and self.load_config is None:
             raise UserError("no scene is named: give --data its folder, or --load-config a run trained on it.")
         with starting(self):
-            from beags_plugin.plugin.objects.check_masks import check, options_beside, write_report
+            from beags_plugin.objects.check_masks import check, options_beside, write_report
         names = ("layout", "images_path", "masks_path", "classes_path", "ignore_ids")
         parser = options_beside(self.load_config, self.data, **{name: getattr(self, name) for name in names})
         report = check(parser, self.min_views, self.load_config)
@@ -92,7 +92,7 @@ class Reproject:
         if not 0.0 <= self.min_confidence <= 1.0:
             raise UserError(f"min_confidence is {self.min_confidence}: it must be a share of the votes, 0 to 1.")
         with starting(self):
-            from beags_plugin.plugin.objects.reproject_masks import (
+            from beags_plugin.objects.reproject_masks import (
                 ReprojectionOptions,
                 reproject_run,
                 write_reprojection,
@@ -129,8 +129,8 @@ class Agree:
 
     def run(self) -> None:
         with starting(self):
-            from beags_plugin.plugin.objects.agree_masks import agree_masks
-            from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions
+            from beags_plugin.objects.agree_masks import agree_masks
+            from beags_plugin.objects.reproject_masks import ReprojectionOptions
         options = ReprojectionOptions(self.masks_path, self.classes_path, run_size=self.run_size, data=self.data)
         for line in agree_masks(self.load_config, options, self.output):
             CONSOLE.print(line)
@@ -165,8 +165,8 @@ class Make:
         if self.snap < 0:
             raise UserError(f"snap is {self.snap}: give a radius in pixels, or 0.")
         with starting(self):
-            from beags_plugin.plugin.objects.check_masks import data_options
-            from beags_plugin.plugin.objects.make_masks import configured_source, make_masks
+            from beags_plugin.objects.check_masks import data_options
+            from beags_plugin.objects.make_masks import configured_source, make_masks
         source = configured_source(self.source, self.options)
         data = data_options(self.data, self.layout, self.images_path)
         for line in make_masks(data, source, self.load_config, self.output, self.overwrite, self.snap, self.upright):
@@ -201,8 +201,8 @@ class Truth:
             raise UserError("NVOS names its objects: leave --object out, and call them so in classes.json.")
         with starting(self):
             from beags_plugin.data.downloads import read_nvos, read_spin_nerf
-            from beags_plugin.plugin.objects.check_masks import data_options
-            from beags_plugin.plugin.objects.import_truth import import_truth
+            from beags_plugin.objects.check_masks import data_options
+            from beags_plugin.objects.import_truth import import_truth
         scene = self.scene or self.data.resolve().name.lower()
         if self.nvos is not None:
             objects = read_nvos(self.nvos, scene)

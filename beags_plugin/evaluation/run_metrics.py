@@ -12,6 +12,7 @@ from torch import Tensor
 
 from beags_plugin.core.color_fit import affine_color_fit, apply_affine
 from beags_plugin.core.membership import Membership
+from beags_plugin.core.select import remove_class, select_class
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.close_up import band_of, close_up, close_up_metrics
 from beags_plugin.evaluation.metrics import covered, mask_metrics, mean, mean_metrics, psnr
@@ -31,7 +32,6 @@ from beags_plugin.evaluation.records import (
 from beags_plugin.evaluation.removal import removal_metrics
 from beags_plugin.evaluation.shown import TAU
 from beags_plugin.evaluation.truths import extracted_truth, object_pixels, removals, rendered_truth, seen_truth
-from beags_plugin.extraction.select import remove_class, select_class
 from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.losses.photometric import ssim
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings

@@ -14,10 +14,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from beags_plugin.core.densification import SH_C0
-from beags_plugin.export.base import Exporter, ExportItem
+from beags_plugin.export.base import Exporter
 from beags_plugin.export.splat_values import SplatValues, smallest_three, splat_values
-from beags_plugin.extraction.files import whole_file
-from beags_plugin.extraction.ply import DISC_COMMENT
+from beags_plugin.splat_io.files import whole_file
+from beags_plugin.splat_io.ply import DISC_COMMENT
+from beags_plugin.surfaces.item import ExportItem
 
 CHUNK = 256  # Gaussians
 _SH_RANGE = 8.0  # coefficients of the higher bands lie in -4..4

@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from beags_plugin.export.color import linear_from_srgb
-from beags_plugin.export.fusion import Mesh
 from beags_plugin.export.gltf import (
     ELEMENT_ARRAY_BUFFER,
     FLOAT,
@@ -23,8 +21,10 @@ from beags_plugin.export.gltf import (
     positions,
     y_up,
 )
-from beags_plugin.export.surface import vertex_normals
-from beags_plugin.export.texture import Texture
+from beags_plugin.surfaces.color import linear_from_srgb
+from beags_plugin.surfaces.fusion import Mesh
+from beags_plugin.surfaces.surface import vertex_normals
+from beags_plugin.surfaces.texture import Texture
 
 _LINEAR, _LINEAR_MIPMAP_LINEAR, _CLAMP_TO_EDGE = 9729, 9987, 33071
 

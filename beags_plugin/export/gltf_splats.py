@@ -16,13 +16,14 @@ from torch import Tensor
 
 from beags_plugin.core.densification import SH_C0
 from beags_plugin.core.surfels import Surfels, opacities
-from beags_plugin.export.base import Exporter, ExportItem
+from beags_plugin.export.base import Exporter
 from beags_plugin.export.glb import add_mesh
 from beags_plugin.export.gltf import FLOAT, UNSIGNED_BYTE, Document, glb_to_world, positions
 from beags_plugin.export.mesh import TexturedExporter
 from beags_plugin.export.splat_parts import SplatPart, splat_parts, thin_log_scales, without_invented, y_up_surfels
-from beags_plugin.extraction.files import whole_file
-from beags_plugin.extraction.ply import THICKNESS
+from beags_plugin.splat_io.files import whole_file
+from beags_plugin.splat_io.ply import THICKNESS
+from beags_plugin.surfaces.item import ExportItem
 
 EXTENSION = "KHR_gaussian_splatting"
 _POINTS = 0

@@ -10,10 +10,10 @@ import torch
 
 from beags_plugin.core.densification import SH_C0
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export.base import Viewpoints
-from beags_plugin.export.close_up import close_up
-from beags_plugin.export.frames import bounding_box
 from beags_plugin.rasterizers.rendering import surfel_inputs
+from beags_plugin.surfaces.close_up import close_up
+from beags_plugin.surfaces.frames import bounding_box
+from beags_plugin.surfaces.item import Viewpoints
 
 _PIXELS = 256  # of the longer side of the pictures that weigh the views
 

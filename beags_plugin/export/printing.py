@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from beags_plugin.export.base import ExportItem
 from beags_plugin.export.mesh import MeshExporter
-from beags_plugin.extraction.files import whole_file
+from beags_plugin.splat_io.files import whole_file
+from beags_plugin.surfaces.item import ExportItem
 
 MILLIMETRES = 1000.0  # in a metre
 

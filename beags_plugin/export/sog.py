@@ -18,10 +18,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from beags_plugin.export.base import Exporter, ExportItem
+from beags_plugin.export.base import Exporter
 from beags_plugin.export.palettes import nearest, palette_of, table_of
 from beags_plugin.export.splat_values import SplatValues, smallest_three, splat_values
-from beags_plugin.extraction.files import whole_file
+from beags_plugin.splat_io.files import whole_file
+from beags_plugin.surfaces.item import ExportItem
 
 VERSION = 2
 _TABLE = 256  # values of a table

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from beags_plugin.export.mesh_options import MeshOptions
+from beags_plugin.surfaces.mesh_options import MeshOptions
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export.base import ExportItem, NothingToExport
 from beags_plugin.export.splat_values import finite_mask
-from beags_plugin.extraction.frames import from_input_frame
+from beags_plugin.splat_io.frames import from_input_frame
+from beags_plugin.surfaces.item import ExportItem, NothingToExport
 
 
 @dataclass(frozen=True)

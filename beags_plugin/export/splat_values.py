@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from beags_plugin.core.surfels import Surfels, opacities
-from beags_plugin.export.base import NothingToExport
-from beags_plugin.extraction.ply import THICKNESS
+from beags_plugin.splat_io.ply import THICKNESS
+from beags_plugin.surfaces.item import NothingToExport
 
 _LEAST_LOG_SCALE = -20.0  # 2e-9 units: a stray that is thinner would only make its neighbours' steps coarser
 _MORTON_BITS = 21  # of each axis: three times as many fill 63 bits

@@ -9,10 +9,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from beags_plugin.core.densification import SH_C0
-from beags_plugin.export.base import Exporter, ExportItem
+from beags_plugin.export.base import Exporter
 from beags_plugin.export.splat_values import splat_values
-from beags_plugin.extraction.files import whole_file
-from beags_plugin.extraction.ply import write_ply
+from beags_plugin.splat_io.files import whole_file
+from beags_plugin.splat_io.ply import write_ply
+from beags_plugin.surfaces.item import ExportItem
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
 

@@ -19,11 +19,12 @@ import numpy as np
 import torch
 
 from beags_plugin.core.surfels import Surfels, opacities
-from beags_plugin.export.base import Exporter, ExportItem
+from beags_plugin.export.base import Exporter
 from beags_plugin.export.splat_values import finite_surfels, smallest_three
-from beags_plugin.extraction.files import whole_file
-from beags_plugin.extraction.frames import to_input_frame
-from beags_plugin.extraction.ply import THICKNESS
+from beags_plugin.splat_io.files import whole_file
+from beags_plugin.splat_io.frames import to_input_frame
+from beags_plugin.splat_io.ply import THICKNESS
+from beags_plugin.surfaces.item import ExportItem
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.zstd import zstandard
 

@@ -20,17 +20,19 @@ from torch import Tensor
 
 from beags_plugin.core.densification import SH_C0
 from beags_plugin.core.surfels import Surfels, opacities
-from beags_plugin.export.base import Exporter, ExportItem, NothingToExport
-from beags_plugin.export.closing import Closed
-from beags_plugin.export.color import linear_from_srgb
-from beags_plugin.export.fusion import decimated, without_small_parts
+from beags_plugin.export.base import Exporter
 from beags_plugin.export.gltf import y_up
-from beags_plugin.export.mesh import MOST, closed_surface, placed_surface
-from beags_plugin.export.mesh_options import MeshOptions
+from beags_plugin.export.mesh import MOST
 from beags_plugin.export.splat_parts import SplatPart, splat_parts, thin_log_scales, without_invented, y_up_surfels
 from beags_plugin.export.usdz import define_mesh, modules, packed
-from beags_plugin.extraction.files import whole_file
-from beags_plugin.extraction.ply import THICKNESS
+from beags_plugin.splat_io.files import whole_file
+from beags_plugin.splat_io.ply import THICKNESS
+from beags_plugin.surfaces.closing import Closed
+from beags_plugin.surfaces.color import linear_from_srgb
+from beags_plugin.surfaces.fusion import decimated, without_small_parts
+from beags_plugin.surfaces.item import ExportItem, NothingToExport
+from beags_plugin.surfaces.mesh_options import MeshOptions
+from beags_plugin.surfaces.meshing import closed_surface, placed_surface
 from beags_plugin.system.errors import check_choice
 
 ROOT = "/Scene"

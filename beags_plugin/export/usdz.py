@@ -15,15 +15,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from beags_plugin.export.base import ExportItem
-from beags_plugin.export.color import linear_from_srgb
-from beags_plugin.export.fusion import Mesh
 from beags_plugin.export.glb import png_bytes
 from beags_plugin.export.gltf import y_up
 from beags_plugin.export.mesh import TexturedExporter
-from beags_plugin.export.surface import vertex_normals
-from beags_plugin.export.texture import Texture
-from beags_plugin.extraction.files import whole_file
+from beags_plugin.splat_io.files import whole_file
+from beags_plugin.surfaces.color import linear_from_srgb
+from beags_plugin.surfaces.fusion import Mesh
+from beags_plugin.surfaces.item import ExportItem
+from beags_plugin.surfaces.surface import vertex_normals
+from beags_plugin.surfaces.texture import Texture
 
 _PICTURE = "colors.png"
 _LONG_AGO = 631152000  # 1990, in seconds since 1970; a package cannot say less than 1980

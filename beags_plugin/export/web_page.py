@@ -17,11 +17,12 @@ import torch
 
 from beags_plugin.core.densification import SH_C0
 from beags_plugin.core.rotations import rotation_from_quat
-from beags_plugin.export.base import Exporter, ExportItem
-from beags_plugin.export.frames import bounding_box
+from beags_plugin.export.base import Exporter
 from beags_plugin.export.page_colors import SeenColors, seen_colors
 from beags_plugin.export.splat_values import SplatValues, splat_values
-from beags_plugin.extraction.files import whole_file
+from beags_plugin.splat_io.files import whole_file
+from beags_plugin.surfaces.frames import bounding_box
+from beags_plugin.surfaces.item import ExportItem
 from beags_plugin.system.errors import UserError
 
 _FIELD_OF_VIEW = math.radians(40.0)  # vertical

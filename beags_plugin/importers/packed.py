@@ -17,9 +17,9 @@ from torch import Tensor
 
 from beags_plugin.core.flattening import Gaussians
 from beags_plugin.core.sh import MAX_DEGREE, num_sh_bases
-from beags_plugin.extraction.far_worlds import FAR
-from beags_plugin.extraction.frames import turned_gaussians
 from beags_plugin.importers.base import ImportedScene
+from beags_plugin.splat_io.far_worlds import FAR
+from beags_plugin.splat_io.frames import turned_gaussians
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.stand_ins import stand_in, starts_as
 from beags_plugin.system.reading.text import reason

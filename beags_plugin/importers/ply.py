@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar
 
-from beags_plugin.extraction.splat_file import read_splat_file
 from beags_plugin.importers.base import ImportedScene, Importer
 from beags_plugin.importers.compressed_ply import is_compressed
+from beags_plugin.splat_io.splat_file import read_splat_file
 
 
 def newest_of_run(path: Path) -> Path | None:

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.membership import Membership
+from beags_plugin.core.select import select_class
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.records import EvalView
 from beags_plugin.evaluation.truths import extracted_truth
-from beags_plugin.extraction.select import select_class
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 from beags_plugin.labels.colors import colorize
 from beags_plugin.pictures.cells import Square, below, cell, checkerboard, crop, square_around, wrapped

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from beags_plugin.extraction.files import whole_file
+from beags_plugin.splat_io.files import whole_file
 from beags_plugin.system.errors import UserError
 
 FILMS = (".mp4", ".gif")

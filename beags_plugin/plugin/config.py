@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from beags_plugin.plugin.options.run_format import other_format
+from beags_plugin.options.run_format import other_format
 from beags_plugin.system.errors import print_user_errors_plainly
 
 

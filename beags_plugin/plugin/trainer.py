@@ -16,13 +16,12 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.importers.base import find_importer
-from beags_plugin.plugin.objects.clean import decide
+from beags_plugin.objects.clean import decide
+from beags_plugin.options.run_format import CONFIG_FILE
+from beags_plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.options.machine import check_machine
 from beags_plugin.plugin.options.rollback import Rollback, noted
-from beags_plugin.plugin.options.run_format import CONFIG_FILE
-from beags_plugin.plugin.options.schedule import PhaseSchedule
-from beags_plugin.plugin.runs.layout import REPORT_FILE
 from beags_plugin.plugin.training.checkpoints import Checkpoints
 from beags_plugin.plugin.training.memory_guard import NO_MEMORY, MemoryWatch, check_room, is_out_of_memory
 from beags_plugin.plugin.training.monitor import HeldOutCurve
@@ -34,6 +33,7 @@ from beags_plugin.plugin.training.timing import Estimate, StageSeconds
 from beags_plugin.plugin.training.warm_start import start_from_scene
 from beags_plugin.plugin.viewer.serving import end_rendering
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
+from beags_plugin.runs.layout import REPORT_FILE
 from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError, is_of_disk, refused, silence_libraries
 from beags_plugin.system.interrupts import Interrupts, stop

@@ -12,7 +12,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import LabelMaps
-from beags_plugin.picking.agreement import AgreedMask, agreed_masks, decide
+from beags_plugin.masks.agreement import AgreedMask, agreed_masks, decide
 from beags_plugin.preparation.consistent_masks import Stage, translated
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 

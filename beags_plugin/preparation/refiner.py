@@ -13,7 +13,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.preparation.own_training import OwnTraining, Stage, TrainedScene
+from beags_plugin.preparation.refiner_training import OwnTraining, Stage, TrainedScene
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 
 Progress = Callable[[int, int], None]

@@ -21,8 +21,8 @@ from beags_plugin.core.densification import Densified, split_by_sampling
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
-from beags_plugin.preparation.own_training import Edit, OwnTraining, TrainedScene
 from beags_plugin.preparation.refiner import Refiner
+from beags_plugin.preparation.refiner_training import Edit, OwnTraining, TrainedScene
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.refiners import mask_logits
 from beags_plugin.system.errors import UserError, check_choice

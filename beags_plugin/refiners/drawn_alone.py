@@ -8,7 +8,7 @@ from math import log
 import torch
 from torch import Tensor
 
-from beags_plugin.preparation.own_training import TrainedScene
+from beags_plugin.preparation.refiner_training import TrainedScene
 from beags_plugin.rasterizers.interface import SurfelInputs
 from beags_plugin.rasterizers.rendering import draw_features, geometry_inputs
 

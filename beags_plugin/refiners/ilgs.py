@@ -24,8 +24,8 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.reduction import ordered_sum
-from beags_plugin.preparation.own_training import Edit, OwnTraining, Terms, TrainedScene
 from beags_plugin.preparation.refiner import Refiner
+from beags_plugin.preparation.refiner_training import Edit, OwnTraining, Terms, TrainedScene
 from beags_plugin.refiners import identity_codes
 from beags_plugin.refiners.learned_codes import LearnedCodes
 from beags_plugin.refiners.object_codebook import code_entropy, members_by_softmax

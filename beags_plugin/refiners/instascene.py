@@ -20,8 +20,8 @@ from beags_plugin.core.membership import Membership
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.losses.base import LossInputs
-from beags_plugin.preparation.own_training import Edit, OwnTraining, Terms, TrainedScene
 from beags_plugin.preparation.refiner import Refiner
+from beags_plugin.preparation.refiner_training import Edit, OwnTraining, Terms, TrainedScene
 from beags_plugin.refiners import mask_tracking, prototypes
 from beags_plugin.refiners.drawn_alone import FrozenDrawing
 from beags_plugin.system.errors import UserError

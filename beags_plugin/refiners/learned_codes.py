@@ -10,7 +10,7 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ranks import ClassRanks
-from beags_plugin.preparation.own_training import TrainedScene
+from beags_plugin.preparation.refiner_training import TrainedScene
 from beags_plugin.rasterizers.rendering import draw_features, surfel_inputs
 from beags_plugin.refiners import identity_codes
 from beags_plugin.system import processes

@@ -28,8 +28,8 @@ from beags_plugin.core.membership import Membership
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.losses import object_entropy
 from beags_plugin.losses.base import LossInputs
-from beags_plugin.preparation.own_training import OwnTraining, Terms, TrainedScene
 from beags_plugin.preparation.refiner import AssignedScene, Refiner
+from beags_plugin.preparation.refiner_training import OwnTraining, Terms, TrainedScene
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.refiners.object_labels import LABELS, labels_by_majority, labels_by_weight
 from beags_plugin.system.errors import UserError, check_choice

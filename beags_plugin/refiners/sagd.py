@@ -11,8 +11,8 @@ from beags_plugin.core.densification import Densified
 from beags_plugin.core.membership import Membership
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.losses.base import LossInputs
-from beags_plugin.preparation.own_training import Edit, OwnTraining, Terms, TrainedScene
 from beags_plugin.preparation.refiner import AssignedScene, Refiner
+from beags_plugin.preparation.refiner_training import Edit, OwnTraining, Terms, TrainedScene
 from beags_plugin.refiners import centre_votes
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.progress import say

@@ -14,13 +14,13 @@ import numpy as np
 import tyro
 
 from beags_plugin.cleaning.clean import clean
-from beags_plugin.export.frames import bounding_box
-from beags_plugin.extraction.select import select_class
+from beags_plugin.core.select import select_class
+from beags_plugin.objects.evaluate import EvaluatedRun
+from beags_plugin.objects.shown import shown_scene
 from beags_plugin.pictures.cells import below, beside, cell, write_picture
 from beags_plugin.pictures.objects import render_alone
 from beags_plugin.pictures.orbit import orbit, orbit_frame, orbit_settings
-from beags_plugin.plugin.objects.evaluate import EvaluatedRun
-from beags_plugin.plugin.objects.shown import shown_scene
+from beags_plugin.surfaces.frames import bounding_box
 
 
 @dataclass

@@ -22,7 +22,7 @@ sys.path.append(str(Path(__file__).parents[2] / "tests/support"))
 from browser import Page  # noqa: E402
 from viewer_pages import viewed  # noqa: E402
 
-from beags_plugin.plugin.runs.run import Run  # noqa: E402
+from beags_plugin.runs.run import Run  # noqa: E402
 from beags_plugin.system.errors import UserError  # noqa: E402
 
 

@@ -34,7 +34,7 @@ from beags_plugin.bench.trials import MODEL, plan
 from beags_plugin.commands import cli
 from beags_plugin.masks.sources import salient
 from beags_plugin.masks.sources.prompts import read_prompts
-from beags_plugin.plugin.objects import make_masks
+from beags_plugin.objects import make_masks
 from beags_plugin.plugin.presets import preset_config
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.system.errors import UserError

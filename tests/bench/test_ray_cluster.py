@@ -28,7 +28,7 @@ from experiment_files import written
 from beags_plugin.bench.engines import ray_cluster
 from beags_plugin.bench.options import ExperimentOptions
 from beags_plugin.bench.run import run_experiment
-from beags_plugin.plugin.runs.place import open_run
+from beags_plugin.runs.relocation import open_run
 from beags_plugin.system.errors import UserError
 
 SWEEP = """

@@ -19,8 +19,8 @@ from beags_plugin.bench.engines.parcels import pack, relocate, unpack
 from beags_plugin.bench.engines.ray_cluster import USUAL_CORES, share
 from beags_plugin.bench.engines.ray_task import TRAINED_FOLDER, Input, Task, perform
 from beags_plugin.bench.engines.trial_folder import SCORED, TRAINED
+from beags_plugin.plugin.options.saved_config import load_run_config
 from beags_plugin.plugin.presets import preset_config
-from beags_plugin.plugin.runs.run_config import load_run_config
 from beags_plugin.system.digests import folder_digest
 from beags_plugin.system.errors import UserError
 

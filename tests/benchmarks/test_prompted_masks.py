@@ -79,8 +79,8 @@ def test_runs_of_different_presets_are_kept_apart_and_not_trained_again(monkeypa
         extracted = {"extracted": {"after": {"biou": biou}}}
         return SimpleNamespace(to_json=lambda: {"mean": extracted, "worst": "cup", "objects": {"cup": extracted}})
 
-    monkeypatch.setattr("beags_plugin.plugin.runs.launch.train", train)
-    monkeypatch.setattr("beags_plugin.plugin.objects.evaluate.evaluate_run", score)
+    monkeypatch.setattr("beags_plugin.plugin.launch.train", train)
+    monkeypatch.setattr("beags_plugin.objects.evaluate.evaluate_run", score)
     for _ in range(2):
         for preset, text in (("beags-fast", "50.0, 50.0"), ("beags-refine", "75.0, 75.0")):
             assert refined(tmp_path, tmp_path, tmp_path, tmp_path / "cut", preset) == text

@@ -13,9 +13,9 @@ from beags_plugin.cleaning.clean import OUTSIDE, LeftOut, clean
 from beags_plugin.cleaning.parts import connected_parts
 from beags_plugin.cleaning.silhouettes import MaskedViews
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.extraction.frames import quat_from_rotation
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs, render_class_map
+from beags_plugin.splat_io.frames import quat_from_rotation
 
 RASTERIZER = make_rasterizer("auto")
 CAMERAS = [

@@ -14,11 +14,11 @@ from run_folders import write_scene
 from beags_plugin.commands import demo
 from beags_plugin.commands.certainty import certainty
 from beags_plugin.commands.made_masks import MADE, as_made
-from beags_plugin.commands.made_scene import MadeScene
+from beags_plugin.commands.scene_setup import MadeScene
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import write_mask
 from beags_plugin.masks.check.contradictions import Contradiction
-from beags_plugin.plugin.objects import check_masks
+from beags_plugin.objects import check_masks
 from beags_plugin.system.digests import folder_digest
 from beags_plugin.system.errors import UserError
 

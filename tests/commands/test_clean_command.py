@@ -15,11 +15,11 @@ from written_splats import read_back, write
 
 pytest.importorskip("nerfstudio")
 
-import beags_plugin.commands.made_scene as made_scenes
+import beags_plugin.commands.scene_setup as made_scenes
 from beags_plugin.commands.cli import main
-from beags_plugin.export.closing_surfels import joined
 from beags_plugin.importers.base import read_scene
-from beags_plugin.plugin.objects.written_back import changes, format_of
+from beags_plugin.objects.written_back import changes, format_of
+from beags_plugin.surfaces.closing_surfels import joined
 
 
 def test_a_scene_is_refined_and_written_back_in_its_format(tmp_path, monkeypatch, capsys):

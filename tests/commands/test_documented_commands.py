@@ -22,7 +22,7 @@ from run_folders import write_camera_path, write_scene, write_trained
 pytest.importorskip("nerfstudio")
 
 from beags_plugin.commands import cli
-from beags_plugin.extraction.ply import write_ply
+from beags_plugin.splat_io.ply import write_ply
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 PROGRAMS = re.compile(r"^(?:[A-Z_]+=\S+ )*(beags|ns-[a-z-]+|make|pip|python) ")
@@ -90,8 +90,8 @@ def folder(tmp_path_factory):
     write_camera_path(write_scene(root / "my_scene") / "camera_paths/flight.json")
     for name in ("run", "other"):
         config = write_trained(root / name, root / "my_scene")
-    from beags_plugin.plugin.objects.extract import extract_objects
-    from beags_plugin.plugin.runs.run import Run
+    from beags_plugin.objects.extract import extract_objects
+    from beags_plugin.runs.run import Run
 
     extract_objects(config.parent.parent / "run/config.yml", ["cup"])
     write_ply(root / "scene.ply", Run(config).assigned.surfels())

@@ -19,9 +19,9 @@ from run_folders import write_drawn_scene
 from start_scenes import write_splatfacto
 from test_documented_commands import commands_of, training_config, words_of
 
-from beags_plugin.extraction.ply import write_ply
 from beags_plugin.labels.classes import read_id_mask
-from beags_plugin.plugin.runs.launch import train
+from beags_plugin.plugin.launch import train
+from beags_plugin.splat_io.ply import write_ply
 
 
 def section(document: str, heading: str) -> str:

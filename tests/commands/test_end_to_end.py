@@ -79,7 +79,7 @@ def test_each_loss_has_its_own_curve(trained):
 
 
 def test_the_base_is_kept_apart_and_has_classes(trained):
-    from beags_plugin.plugin.runs.run import Run
+    from beags_plugin.runs.run import Run
 
     folder, _ = trained
     base, refined = Run(folder / "base" / "config.yml").assigned, Run(folder / "config.yml").assigned
@@ -99,8 +99,8 @@ def extracted(trained):
 
 
 def test_extraction_writes_a_run_and_a_ply_per_object(trained, extracted):
-    from beags_plugin.plugin.runs.layout import EXTRACTION_FILE
-    from beags_plugin.plugin.runs.run import Run
+    from beags_plugin.runs.layout import EXTRACTION_FILE
+    from beags_plugin.runs.run import Run
 
     folder, _ = trained
     whole = Run(folder / "config.yml").assigned
@@ -162,8 +162,8 @@ def test_export_writes_every_object_and_the_background(trained, tmp_path):
 
 
 def test_removing_an_object_keeps_the_rest(trained):
-    from beags_plugin.plugin.objects.extract import extract_objects
-    from beags_plugin.plugin.runs.run import Run
+    from beags_plugin.objects.extract import extract_objects
+    from beags_plugin.runs.run import Run
 
     folder, _ = trained
     whole = Run(folder / "config.yml").assigned
@@ -173,7 +173,7 @@ def test_removing_an_object_keeps_the_rest(trained):
 
 
 def test_refiner_none_leaves_the_scene_as_it_is(trained, data, tmp_path):
-    from beags_plugin.plugin.runs.run import Run
+    from beags_plugin.runs.run import Run
 
     folder, _ = trained
     called(
@@ -187,7 +187,7 @@ def test_refiner_none_leaves_the_scene_as_it_is(trained, data, tmp_path):
 
 
 def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, data, tmp_path):
-    from beags_plugin.plugin.runs.run import Run
+    from beags_plugin.runs.run import Run
 
     folder, _ = trained
     text = called(
@@ -207,7 +207,7 @@ def test_a_trained_scene_is_rendered_whole_cropped_and_by_object(trained):
     from nerfstudio.data.scene_box import OrientedBox
     from nerfstudio.utils.eval_utils import eval_setup
 
-    from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+    from beags_plugin.views.cameras import camera_from_nerfstudio
 
     folder, _ = trained
     _, pipeline, _, _ = eval_setup(folder / "config.yml", test_mode="test")
@@ -228,7 +228,7 @@ def test_a_trained_scene_is_rendered_whole_cropped_and_by_object(trained):
 def test_demo_on_a_folder_writes_table_figures_and_picture(trained, data, tmp_path, monkeypatch):
     """The measuring half of the demo, on the run that is there."""
     from beags_plugin.commands.demo import measure
-    from beags_plugin.commands.made_scene import MadeScene
+    from beags_plugin.commands.scene_setup import MadeScene
 
     folder, _ = trained
     measure(folder, tmp_path, {}, MadeScene(data))

@@ -16,7 +16,7 @@ from beags_plugin.commands.cli import main
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Progress, SourceScene
-from beags_plugin.plugin.objects.make_masks import make_masks
+from beags_plugin.objects.make_masks import make_masks
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.system.errors import UserError
 
@@ -185,9 +185,9 @@ def test_reprojection_of_a_run_writes_masks_of_the_photos_size(tmp_path, lens, c
 
 
 def test_the_check_of_a_run_takes_its_options_and_what_replaces_them(tmp_path):
-    from beags_plugin.plugin.objects.check_masks import options_beside
-    from beags_plugin.plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject
-    from beags_plugin.plugin.runs.run import Run
+    from beags_plugin.objects.check_masks import options_beside
+    from beags_plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject
+    from beags_plugin.runs.run import Run
 
     data = write_scene(tmp_path / "scene")
     config = write_trained(tmp_path / "run", data)
@@ -204,7 +204,7 @@ def test_the_check_of_a_run_takes_its_options_and_what_replaces_them(tmp_path):
 
 
 def test_the_geometry_of_a_run_has_its_held_out_views_too(tmp_path):
-    from beags_plugin.plugin.objects.make_masks import RunGeometry
+    from beags_plugin.objects.make_masks import RunGeometry
 
     data = write_scene(tmp_path / "scene")
     geometry = RunGeometry(write_trained(tmp_path / "run", data))

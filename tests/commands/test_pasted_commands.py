@@ -56,7 +56,7 @@ def test_the_command_after_poses(tmp_path, capsys, monkeypatch):
 
 
 def test_the_command_of_a_base_without_classes(tmp_path):
-    from beags_plugin.plugin.runs.run import Run
+    from beags_plugin.runs.run import Run
 
     folder = tmp_path / "my run [1]"
     config = write_trained(folder, write_scene(tmp_path / "scene"), assigned=False)

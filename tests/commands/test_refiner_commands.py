@@ -9,8 +9,8 @@ from run_folders import write_scene
 pytest.importorskip("nerfstudio")
 
 from beags_plugin.core.membership import Membership
-from beags_plugin.plugin.runs.place import open_run
-from beags_plugin.plugin.runs.read import read_run
+from beags_plugin.runs.read import read_run
+from beags_plugin.runs.relocation import open_run
 from beags_plugin.system.reading.ply import read_vertices
 
 TRAIN = (

@@ -11,11 +11,11 @@ pytest.importorskip("nerfstudio")
 pytest.importorskip("pycolmap")
 
 from beags_plugin.commands import demo
-from beags_plugin.commands.made_scene import MadeScene, made_scene
 from beags_plugin.commands.process import find_poses
+from beags_plugin.commands.scene_setup import MadeScene, made_scene
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.masks.sources.salient import SalientSource
-from beags_plugin.plugin.objects.check_masks import check_scene
+from beags_plugin.objects.check_masks import check_scene
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.posing.process import NothingFits
 from beags_plugin.system.errors import UserError
@@ -119,7 +119,7 @@ def test_poses_of_too_few_photos_are_not_taken(tmp_path, room, monkeypatch, caps
             raise NothingFits("none of the photos fit")
         return lines
 
-    monkeypatch.setattr("beags_plugin.commands.made_scene.find_poses", found)
+    monkeypatch.setattr("beags_plugin.commands.scene_setup.find_poses", found)
     write_turntable(tmp_path / "photos/images", plain=5)
     for index in range(PHOTOS):
         write_image(tmp_path / f"photos/masks/v{index:02d}.png", THING.astype(np.uint8))

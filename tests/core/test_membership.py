@@ -4,7 +4,7 @@ import torch
 from support.random_surfels import random_surfels
 
 from beags_plugin.core.membership import Membership
-from beags_plugin.extraction.select import remove_class, select_class
+from beags_plugin.core.select import remove_class, select_class
 
 PHI = torch.tensor([0, 2, 1, 2, 0, 2, 1], dtype=torch.int32)
 # 1 and 2 share Gaussian 3; 5, of class 2 by phi, belongs to nobody; 4, background by phi, to 1

@@ -26,9 +26,9 @@ import beags_plugin.data.files as files
 from beags_plugin.data import LAYOUTS
 from beags_plugin.data.dataset import Dataset, PoseTable
 from beags_plugin.data.layout import Layout
-from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.system.errors import UserError
+from beags_plugin.views.cameras import camera_from_nerfstudio
 
 
 @pytest.mark.parametrize(("gone", "factor", "size"), [((), 4, (5, 3)), (("images_4", "images_8"), 2, (10, 6))])

@@ -13,7 +13,7 @@ from parsed_views import AS_GIVEN, POINT, moved, names, parse, pixel, real, titl
 
 import beags_plugin.data.files as files
 from beags_plugin.data.files import image_size
-from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
+from beags_plugin.views.cameras import camera_from_nerfstudio
 
 
 def test_llff_scales_the_intrinsics_to_the_images_and_turns_the_axes(tmp_path):

@@ -10,10 +10,10 @@ from layout_folders import ids, opencv_matrices, write_3dovs, write_dtu, write_l
 from parsed_views import AS_GIVEN, POINT, names, parse, pixel, title
 
 from beags_plugin.data.layouts.dtu import decompose
-from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.system.errors import UserError
+from beags_plugin.views.cameras import camera_from_nerfstudio
 
 
 def test_lerf_mask(tmp_path, capsys):
@@ -44,7 +44,7 @@ def test_prompts_of_lerf_mask_are_scored_by_class_name(tmp_path):
     """
     from run_folders import write_trained
 
-    from beags_plugin.plugin.objects.evaluate import EvaluatedRun, evaluate_run
+    from beags_plugin.objects.evaluate import EvaluatedRun, evaluate_run
 
     write_lerf_mask(tmp_path / "figurines")
     write_image(tmp_path / "figurines/test_mask/1/cup.png", 255 * ids())
@@ -61,7 +61,7 @@ def test_prompts_of_lerf_mask_are_scored_by_class_name(tmp_path):
 def test_the_masks_of_dtu_train_and_evaluate(tmp_path):
     """Three-channel masks as class maps of a data manager, and as silhouettes of the class called object."""
     from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
-    from beags_plugin.plugin.views.held_out_views import HeldOutViews
+    from beags_plugin.views.held_out_views import HeldOutViews
 
     write_dtu(tmp_path)
     manager = BeagsDataManagerConfig(dataparser=BeagsDataParserConfig(data=tmp_path)).setup(device="cpu")

@@ -20,12 +20,17 @@ from scipy.spatial import cKDTree
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import project
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export import fusion
-from beags_plugin.export.base import ExportItem, NothingToExport, Viewpoints, make_exporter
-from beags_plugin.export.close_up import close_up
-from beags_plugin.export.color import linear_from_srgb
-from beags_plugin.export.frames import bounding_box
-from beags_plugin.export.fusion import (
+from beags_plugin.export.base import make_exporter
+from beags_plugin.export.mesh import GlbExporter
+from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.rasterizers.interface import RasterSettings
+from beags_plugin.sample.scene import Thing
+from beags_plugin.sample.views import make_views
+from beags_plugin.surfaces import fusion
+from beags_plugin.surfaces.close_up import close_up
+from beags_plugin.surfaces.color import linear_from_srgb
+from beags_plugin.surfaces.frames import bounding_box
+from beags_plugin.surfaces.fusion import (
     Mesh,
     _grid_mb,
     decimated,
@@ -34,12 +39,8 @@ from beags_plugin.export.fusion import (
     voxel_size,
     without_small_parts,
 )
-from beags_plugin.export.mesh import GlbExporter
-from beags_plugin.export.mesh_options import MeshOptions
-from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.interface import RasterSettings
-from beags_plugin.sample.scene import Thing
-from beags_plugin.sample.views import make_views
+from beags_plugin.surfaces.item import ExportItem, NothingToExport, Viewpoints
+from beags_plugin.surfaces.mesh_options import MeshOptions
 from beags_plugin.system.errors import UserError
 
 OPTIONS: dict[str, Any] = {
@@ -235,7 +236,7 @@ def test_voxels_grow_to_keep_the_memory():
 
 def test_the_grid_keeps_its_bound(item, monkeypatch):
     """All blocks that Open3D allocates, at 20 bytes a voxel, stay within the bound."""
-    from beags_plugin.export import fusion
+    from beags_plugin.surfaces import fusion
 
     grids = []
     make = fusion._new_grid

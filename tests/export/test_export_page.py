@@ -24,14 +24,15 @@ pytest.importorskip("viser")
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import sh_colors
-from beags_plugin.export.base import ExportItem, NothingToExport, Viewpoints, make_exporter
-from beags_plugin.export.frames import bounding_box
+from beags_plugin.export.base import make_exporter
 from beags_plugin.export.page_colors import seen_colors
 from beags_plugin.export.splat_values import splat_values
 from beags_plugin.export.web_page import recording, splat_buffer, web_page
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.sample.views import make_views
+from beags_plugin.surfaces.frames import bounding_box
+from beags_plugin.surfaces.item import ExportItem, NothingToExport, Viewpoints
 from beags_plugin.system.errors import UserError
 
 DRAWN = 215  # of 255: darker pixels are the object's, on white

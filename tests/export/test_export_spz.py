@@ -14,10 +14,11 @@ from written_splats import angles, read_back, write
 
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels, opacities
-from beags_plugin.export.base import ExportItem, make_exporter
+from beags_plugin.export.base import make_exporter
 from beags_plugin.export.spz import fractional_bits
 from beags_plugin.importers.base import read_scene
 from beags_plugin.importers.spz import HALF_TURN_SIGNS
+from beags_plugin.surfaces.item import ExportItem
 from beags_plugin.system.errors import UserError
 
 VERSIONS = pytest.mark.parametrize("version", [3, 4])

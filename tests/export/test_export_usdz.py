@@ -18,9 +18,9 @@ from pxr import Usd, UsdGeom, UsdShade, UsdValidation
 from textured_balls import a_ball, texture_of
 
 from beags_plugin.export.base import make_exporter
-from beags_plugin.export.color import linear_from_srgb
-from beags_plugin.export.surface import vertex_normals
 from beags_plugin.export.usdz import usdz_bytes
+from beags_plugin.surfaces.color import linear_from_srgb
+from beags_plugin.surfaces.surface import vertex_normals
 from beags_plugin.system.errors import UserError
 
 

@@ -22,11 +22,12 @@ from written_splats import angles, differences, read_back
 from written_splats import write as written
 
 from beags_plugin.core.surfels import Surfels, opacities
-from beags_plugin.export.base import ExportItem, NothingToExport, make_exporter
+from beags_plugin.export.base import make_exporter
 from beags_plugin.export.palettes import nearest, palette_of, table_of
 from beags_plugin.export.splat_values import morton_order
-from beags_plugin.extraction.ply import THICKNESS
 from beags_plugin.importers.base import read_scene
+from beags_plugin.splat_io.ply import THICKNESS
+from beags_plugin.surfaces.item import ExportItem, NothingToExport
 
 SUFFIXES = {"compressed-ply": "compressed.ply", "sog": "sog"}
 FORMATS = pytest.mark.parametrize("kind", SUFFIXES)

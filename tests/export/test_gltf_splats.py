@@ -33,11 +33,12 @@ from written_splats import differences, write
 from beags_plugin.core.flattening import flatten
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export.base import ExportItem, NothingToExport, make_exporter
-from beags_plugin.export.closing_surfels import with_closing
-from beags_plugin.export.mesh_options import MeshOptions
-from beags_plugin.extraction.ply import THICKNESS
+from beags_plugin.export.base import make_exporter
 from beags_plugin.importers.base import read_scene
+from beags_plugin.splat_io.ply import THICKNESS
+from beags_plugin.surfaces.closing_surfels import with_closing
+from beags_plugin.surfaces.item import ExportItem, NothingToExport
+from beags_plugin.surfaces.mesh_options import MeshOptions
 from beags_plugin.system.errors import UserError
 
 NAMES = {0: "background", 1: "a naïve cup", 2: "box"}

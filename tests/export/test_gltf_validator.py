@@ -21,9 +21,9 @@ from photographed_box import EYES, a_box, camera_from, photo_of
 from textured_balls import a_ball, texture_of
 
 from beags_plugin.export.base import make_exporter
-from beags_plugin.export.fusion import Mesh
 from beags_plugin.export.glb import glb_bytes
-from beags_plugin.export.texture import textured
+from beags_plugin.surfaces.fusion import Mesh
+from beags_plugin.surfaces.texture import textured
 
 _PROGRAM = """
 const validator = require(process.argv[1]);

@@ -8,9 +8,9 @@ import pytest
 import torch
 from random_surfels import a_rotation
 
-from beags_plugin.export.frames import Frame
 from beags_plugin.export.pose_options import KnownLength, PhotoPoint, PoseOptions, scale_by_text
-from beags_plugin.export.standing import standing_plane, turn_to_z
+from beags_plugin.surfaces.frames import Frame
+from beags_plugin.surfaces.ground_plane import standing_plane, turn_to_z
 from beags_plugin.system.errors import UserError
 
 

@@ -15,13 +15,13 @@ from beags_plugin.core.flattening import Gaussians, flatten, flattening, without
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.extraction.frames import from_input_frame, to_input_frame
-from beags_plugin.extraction.ply import write_ply
-from beags_plugin.extraction.splat_file import read_splat_file
 from beags_plugin.importers import IMPORTERS
 from beags_plugin.importers.base import find_importer
 from beags_plugin.importers.checkpoint import CheckpointImporter
 from beags_plugin.importers.ply import PlyImporter
+from beags_plugin.splat_io.frames import from_input_frame, to_input_frame
+from beags_plugin.splat_io.ply import write_ply
+from beags_plugin.splat_io.splat_file import read_splat_file
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.ply import read_vertices, write_vertices
 from beags_plugin.system.reading.tensors import load_tensors

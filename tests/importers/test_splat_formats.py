@@ -21,9 +21,9 @@ from written_splats import angles, differences, write
 
 from beags_plugin.core.flattening import Gaussians, flatten
 from beags_plugin.core.surfels import Surfels, opacities
-from beags_plugin.extraction.ply import write_ply
 from beags_plugin.importers.base import find_importer, read_scene
 from beags_plugin.importers.spz import HALF_TURN_SIGNS
+from beags_plugin.splat_io.ply import write_ply
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.ply import read_vertices, write_vertices
 

@@ -67,7 +67,7 @@ def test_masks_that_are_made_are_compared_too(tmp_path, capsys):
 
 
 def test_damaged_masks_of_a_capture_are_named_and_no_others(tmp_path):
-    from beags_plugin.plugin.objects.check_masks import check_scene, data_options
+    from beags_plugin.objects.check_masks import check_scene, data_options
     from benchmarks.masks import damaged_mask
 
     root, generator = real("fruit"), np.random.default_rng(0)
@@ -112,7 +112,7 @@ def test_contradicted_areas_are_wider_than_outlines():
 
 def test_areas_that_a_run_contradicts_are_reported_with_their_cost(tmp_path):
     from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
-    from beags_plugin.plugin.objects.check_masks import add_areas, check_scene, data_options, write_contradictions
+    from beags_plugin.objects.check_masks import add_areas, check_scene, data_options, write_contradictions
 
     def change(view, ids):
         blob = ids.copy()

@@ -70,7 +70,7 @@ def loss(name: str, **values: Any) -> Callable[[Place], Any]:
     """Return a mistake in the losses of the config, as a package of one's own would make it."""
 
     def make(at: Place):
-        from beags_plugin.plugin.options.loss_spec import LossSpec
+        from beags_plugin.options.loss_spec import LossSpec
 
         config = at.config()
         spec = config.model_config.losses.get(name, LossSpec())

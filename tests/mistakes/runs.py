@@ -178,7 +178,7 @@ def broken_off(at: Place) -> Path:
     """Return a run of ``data`` that ended in the middle of refinement."""
     import yaml
 
-    from beags_plugin.plugin.runs.run_config import load_run_config
+    from beags_plugin.plugin.options.saved_config import load_run_config
 
     short = at.config("--pipeline.model.base-steps", "6", "--pipeline.model.refine-steps", "8", *SHORT[4:])
     run = at.root / "run"

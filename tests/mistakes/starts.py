@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from run_folders import discs
 
-from beags_plugin.extraction.ply import write_ply
+from beags_plugin.splat_io.ply import write_ply
 from mistakes.table import Place, mistakes
 
 COLUMNS = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3))]

@@ -10,7 +10,7 @@ from trained_scenes import FAR_APART, trained_scene
 
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.preparation.own_training import TrainedScene
+from beags_plugin.preparation.refiner_training import TrainedScene
 from beags_plugin.refiners import make_refiner, mask_tracking
 from beags_plugin.refiners import prototypes as parts
 from beags_plugin.refiners.instascene import ContrastTraining, InstaSceneRefiner

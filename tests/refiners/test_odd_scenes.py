@@ -11,7 +11,7 @@ import torch
 from trained_scenes import FAR_APART, loss_inputs, trained_scene
 
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.preparation.own_training import TrainedScene
+from beags_plugin.preparation.refiner_training import TrainedScene
 from beags_plugin.refiners import make_refiner, object_codebook
 
 REFINERS = {

@@ -12,7 +12,7 @@ from trained_scenes import FAR_APART, loss_inputs, trained_scene
 
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.preparation.own_training import TrainedScene
+from beags_plugin.preparation.refiner_training import TrainedScene
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.refiners import instance_features as parts

@@ -12,7 +12,7 @@ from trained_scenes import FAR_APART, loss_inputs, trained_scene
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.preparation.own_training import TrainedScene
+from beags_plugin.preparation.refiner_training import TrainedScene
 from beags_plugin.refiners import object_codebook
 from beags_plugin.refiners.unified_lift import CodebookTraining, UnifiedLiftRefiner
 from beags_plugin.system.errors import UserError

@@ -216,10 +216,12 @@ def import_everything() -> None:
     from nerfstudio.scripts import train  # noqa: F401
 
     from beags_plugin.commands import cli  # noqa: F401
+    from beags_plugin.objects import export  # noqa: F401
     from beags_plugin.ops import extension
-    from beags_plugin.plugin import methods  # noqa: F401
-    from beags_plugin.plugin.objects import export  # noqa: F401
-    from beags_plugin.plugin.runs import launch  # noqa: F401
+    from beags_plugin.plugin import (
+        launch,  # noqa: F401
+        methods,  # noqa: F401
+    )
     from beags_plugin.sample import writer  # noqa: F401
 
     extension.load()
@@ -234,8 +236,8 @@ def write_data(folder: Path) -> None:
 
 def train(data: Path, run: Path) -> None:
     """Train as ns-train does once it has read its arguments."""
+    from beags_plugin.plugin.launch import train
     from beags_plugin.plugin.presets import preset_config
-    from beags_plugin.plugin.runs.launch import train
 
     config = preset_config("beags-tiny", OPTIONS, Path("kill_test.py"))
     config.data, config.run_dir = data, run

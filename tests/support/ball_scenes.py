@@ -75,7 +75,7 @@ def write_model(root: Path) -> None:
 
 def issues(root: Path, **options) -> dict[str, list]:
     """Return what the check finds, by kind."""
-    from beags_plugin.plugin.objects.check_masks import check_scene, data_options
+    from beags_plugin.objects.check_masks import check_scene, data_options
 
     found: dict[str, list] = {}
     for issue in check_scene(data_options(root, **options)).issues:

@@ -14,7 +14,7 @@ from run_folders import SETTINGS, discs, ring_cameras, write_drawn_scene
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.membership import Membership
-from beags_plugin.extraction.select import select_class
+from beags_plugin.core.select import select_class
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs
 

@@ -10,11 +10,11 @@ import torch
 from beags_plugin.core.cameras import Camera, viewmat_from_opengl
 from beags_plugin.core.lifting import pixel_rays
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export.close_up import close_up
 from beags_plugin.sample.arrangement import make_still
 from beags_plugin.sample.scene import Thing
 from beags_plugin.sample.solids import Solid
 from beags_plugin.sample.views import View
+from beags_plugin.surfaces.close_up import close_up
 
 C0 = 0.28209479177387814  # of the constant spherical harmonic
 

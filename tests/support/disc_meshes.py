@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export.fusion import Mesh
+from beags_plugin.surfaces.fusion import Mesh
 
 
 def discs_on(mesh: Mesh) -> Surfels:

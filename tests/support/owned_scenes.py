@@ -9,8 +9,8 @@ from run_folders import CLASSES, SETTINGS, discs, drawn_labels, ring_cameras
 
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.label_maps import LabelMaps
-from beags_plugin.preparation.own_training import Edit, OwnTraining, TrainedScene
 from beags_plugin.preparation.refiner import Refiner
+from beags_plugin.preparation.refiner_training import Edit, OwnTraining, TrainedScene
 from beags_plugin.rasterizers import make_rasterizer
 
 

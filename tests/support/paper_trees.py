@@ -18,8 +18,8 @@ from run_folders import SETTINGS, discs
 
 from beags_plugin.core.cameras import Camera, viewmat_from_opengl
 from beags_plugin.core.membership import Membership
+from beags_plugin.core.select import select_class
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.extraction.select import select_class
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs, render_class_map, surfel_inputs
 

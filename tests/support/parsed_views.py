@@ -9,8 +9,8 @@ import pytest
 from data_folders import SCENES
 
 from beags_plugin.data.layout import find_layout
-from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+from beags_plugin.views.cameras import camera_from_nerfstudio
 
 AS_GIVEN = dict(orientation_method="none", center_method="none", auto_scale_poses=False)
 POINT = np.array([0.3, -0.2, 0.4])

@@ -9,9 +9,9 @@ import torch
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import pixel_rays
-from beags_plugin.export.base import Photo
-from beags_plugin.export.color import srgb_from_linear
-from beags_plugin.export.fusion import Mesh
+from beags_plugin.surfaces.color import srgb_from_linear
+from beags_plugin.surfaces.fusion import Mesh
+from beags_plugin.surfaces.item import Photo
 
 VOXEL = 0.02
 EXPOSURES = np.array([0.7, 0.9, 1.0, 1.1, 1.3, 1.05])

@@ -46,14 +46,14 @@ def short_config(data: Path, run: Path, **overrides):
 
 def run_to_end(config):
     """Train as ns-train does."""
-    from beags_plugin.plugin.runs.launch import train
+    from beags_plugin.plugin.launch import train
 
     train(config)
 
 
 def resume_to_end(run: Path, device: str | None = None):
     """Resume a run as ``beags resume`` does."""
-    from beags_plugin.plugin.runs.launch import resume
+    from beags_plugin.plugin.launch import resume
 
     resume(run, device)
 

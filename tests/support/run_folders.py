@@ -91,7 +91,7 @@ def write_trained(
     scale: of the world, with its cameras.
     """
     from beags_plugin.plugin.options.config import base_config
-    from beags_plugin.plugin.runs.write import write_run
+    from beags_plugin.runs.write import write_run
 
     config = base_config()
     config.run_dir = folder
@@ -106,8 +106,8 @@ def write_trained(
 
 def rename_classes(config_path: Path, classes: dict[int, str]) -> None:
     """Give a run's classes other names, and more of them, which then have no Gaussians."""
-    from beags_plugin.plugin.runs.place import open_run
-    from beags_plugin.plugin.runs.write import write_run
+    from beags_plugin.runs.relocation import open_run
+    from beags_plugin.runs.write import write_run
 
     state = state_of(*discs()) | {"_extra_state": {"classes": classes}}
     write_run(open_run(config_path), config_path.parent, state, 299)

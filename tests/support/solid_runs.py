@@ -61,7 +61,7 @@ def write_solids_run(
     assigned: as a run whose classes are the solids; spilled: but the low one has the floor about it too.
     """
     from beags_plugin.plugin.options.config import base_config
-    from beags_plugin.plugin.runs.write import write_run
+    from beags_plugin.runs.write import write_run
 
     config = base_config()
     config.run_dir = folder

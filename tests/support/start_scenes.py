@@ -13,10 +13,10 @@ from run_folders import discs
 from beags_plugin.core.cameras import Camera, viewmat_from_opengl
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.extraction.frames import from_input_frame
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs
+from beags_plugin.splat_io.frames import from_input_frame
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def drawn(surfels: Surfels, camera: Camera, settings: RasterSettings) -> torch.T
 
 def with_volume(surfels: Surfels, thickness: float = 1e-3, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     """Return (log_scales [N, 3], quats [N, 4]) of the same discs with a thin third axis, which is any of the three."""
-    from beags_plugin.extraction.frames import quat_from_rotation
+    from beags_plugin.splat_io.frames import quat_from_rotation
 
     rotations = rotation_from_quat(surfels.quats.double())
     thin = surfels.log_scales.amin(dim=1, keepdim=True) + float(np.log(thickness))

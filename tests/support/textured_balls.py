@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from beags_plugin.export.atlas import unwrapped
-from beags_plugin.export.fusion import Mesh
-from beags_plugin.export.texture import Texture
+from beags_plugin.surfaces.atlas import unwrapped
+from beags_plugin.surfaces.fusion import Mesh
+from beags_plugin.surfaces.texture import Texture
 
 
 def a_ball() -> Mesh:

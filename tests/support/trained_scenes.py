@@ -12,7 +12,7 @@ from beags_plugin.core.cameras import Camera, viewmat_from_opengl
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.losses.base import LossInputs
-from beags_plugin.preparation.own_training import TrainedScene
+from beags_plugin.preparation.refiner_training import TrainedScene
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import render_class_map, surfel_inputs

@@ -8,8 +8,9 @@ import torch
 
 from beags_plugin.core.flattening import Gaussians, flatten
 from beags_plugin.core.surfels import Surfels, opacities
-from beags_plugin.export.base import ExportItem, make_exporter
+from beags_plugin.export.base import make_exporter
 from beags_plugin.importers.base import read_scene
+from beags_plugin.surfaces.item import ExportItem
 
 
 def write(path: Path, kind: str, surfels: Surfels, **options) -> Path:

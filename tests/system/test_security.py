@@ -23,8 +23,8 @@ from run_folders import write_scene, write_trained
 from beags_plugin.data.transforms_file import read_transforms
 from beags_plugin.masks.sources.coco import packed_total
 from beags_plugin.plugin.options.config import config_text
-from beags_plugin.plugin.runs import run_config
-from beags_plugin.plugin.runs.run_config import load_run_config
+from beags_plugin.plugin.options.saved_config import load_run_config
+from beags_plugin.runs import run_config
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.filed_tensors import FiledTensors, write_tensors
 from beags_plugin.system.reading.arrays import load_array, load_arrays
@@ -46,7 +46,7 @@ ATTACKS = [
     "!!python/object/apply:pathlib.Path.touch ['{ran}']",
     "!!python/object/apply:torch.optim.adam.Adam [[]]",
     "!!python/object/new:subprocess.Popen [['touch', '{ran}']]",
-    "!!python/object/new:beags_plugin.extraction.splat_file.SplatFile {{args: [1], state: {{a: 1}}}}",
+    "!!python/object/new:beags_plugin.splat_io.splat_file.SplatFile {{args: [1], state: {{a: 1}}}}",
     "!!python/name:os.system ''",
     "!!python/name:nerfstudio.utils.scripts.run_command ''",
     "!!python/module:os ''",
@@ -87,6 +87,17 @@ def test_configs_of_runs_are_read_as_nerfstudio_reads_them(config):
 
     text = config.read_text("utf8")
     assert yaml.dump(load_run_config(config)) == yaml.dump(yaml.load(text, Loader=yaml.Loader))
+
+
+def test_classes_that_have_moved_since_are_found_under_their_former_names(config, tmp_path):
+    import yaml
+
+    own = "!!python/object:beags_plugin.options.loss_spec.LossSpec"
+    text = config.read_text("utf8")
+    assert own in text
+    (tmp_path / "config.yml").write_text(text.replace(own, own.replace(".options.", ".plugin.options.")), "utf8")
+    for read in (load_run_config, lambda path: yaml.load(path.read_text("utf8"), Loader=yaml.Loader)):
+        assert yaml.dump(read(tmp_path / "config.yml")) == yaml.dump(load_run_config(config))
 
 
 def test_paths_in_config_yml_are_words_that_people_edit(config, tmp_path):

@@ -93,9 +93,9 @@ def make_masks_once(found: FoundCapture, kind: str, folder: Path, run: Path | No
 
     run: config.yml of the base from which objects are picked. Raises ``UserError`` where none can be made.
     """
+    from beags_plugin.masks.sources.cut import CutSource
     from beags_plugin.masks.sources.salient import SalientSource
-    from beags_plugin.picking.source import CutSource
-    from beags_plugin.plugin.objects.make_masks import make_masks
+    from beags_plugin.objects.make_masks import make_masks
 
     if (folder / COMPLETE).exists():
         os.utime(folder / COMPLETE)

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from beags_plugin.core.cameras import Camera
     from beags_plugin.core.surfels import Surfels
     from beags_plugin.evaluation.records import EvalView
-    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
-    from beags_plugin.plugin.runs.read import SavedScene
+    from beags_plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.rasterizers.interface import RasterSettings
+    from beags_plugin.runs.read import SavedScene
 
 SIDE = 200  # pixels of a picture of an object, and height of one of the scene
 AROUND, ABOVE = 4, 20.0  # pictures on a circle, degrees above the horizon
@@ -36,10 +36,10 @@ def write_sheet(path: Path, runs: Sequence[VariantTrial], outcomes: Mapping[str,
 
     All rows are seen by the same cameras: an object's box is the median of those that it has in the rows.
     """
+    from beags_plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.pictures.cells import below, beside, cell, write_picture
     from beags_plugin.pictures.objects import render_alone
-    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
-    from beags_plugin.plugin.runs.read import read_run
+    from beags_plugin.runs.read import read_run
 
     own = [run for run in runs if run.seed == runs[0].seed]
     done = [run for run in own if outcomes[run.trial.digest].failed is None]
@@ -76,7 +76,7 @@ def _held_out(run: EvaluatedRun) -> EvalView:
 
 
 def _alone(scene: SavedScene, class_id: int) -> Surfels:
-    from beags_plugin.extraction.select import select_class
+    from beags_plugin.core.select import select_class
 
     return select_class(scene.surfels(), scene.members, class_id)[0]
 

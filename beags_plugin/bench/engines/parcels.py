@@ -48,7 +48,7 @@ def unpack(parcel: bytes, folder: Path) -> None:
 def relocate(folder: Path, moved: Mapping[Path, Path]) -> None:
     """Let the configs of the runs below ``folder`` name other places. moved: new places by old ones, both folders."""
     from beags_plugin.plugin.options.config import CONFIG_FILE, config_text
-    from beags_plugin.plugin.runs.run_config import load_run_config
+    from beags_plugin.plugin.options.saved_config import load_run_config
 
     if not moved:
         return

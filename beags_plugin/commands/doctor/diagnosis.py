@@ -38,9 +38,9 @@ def checks_of_data(data: Path | None) -> Iterator[Check]:
     import tempfile
 
     from beags_plugin.plugin.training.memory_guard import LEAST_FREE_MB, free_disk_mb
-    from beags_plugin.plugin.views.data_options import DataOptions
-    from beags_plugin.plugin.views.scene_data import SceneData
     from beags_plugin.system.memory import available_mb
+    from beags_plugin.views.data_options import DataOptions
+    from beags_plugin.views.scene_data import SceneData
 
     scene, output = SceneData(DataOptions(data=data)), Path("outputs")  # nerfstudio's usual folder
     train, held_out = (len(scene.split(split).cameras) for split in ("train", "val"))

@@ -7,7 +7,7 @@ MASK_SOURCES = Registry(
     "beags.mask_sources",
     {
         "coco": "beags_plugin.masks.sources.coco:CocoSource",
-        "cut": "beags_plugin.picking.source:CutSource",
+        "cut": "beags_plugin.masks.sources.cut:CutSource",
         "gaussian-grouping": "beags_plugin.masks.sources.id_images:GaussianGroupingSource",
         "grabcut": "beags_plugin.masks.sources.grabcut:GrabCutSource",
         "id-images": "beags_plugin.masks.sources.id_images:IdImagesSource",

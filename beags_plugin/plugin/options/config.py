@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path, PurePath
 from typing import Annotated, Any, cast
 
@@ -15,13 +17,15 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from tyro.conf import Suppress
 
+from beags_plugin.options.loss_spec import LossSpec
+from beags_plugin.options.run_format import CONFIG_FILE, RUN_FORMAT, other_format
 from beags_plugin.plugin.options import rollback
-from beags_plugin.plugin.options.loss_spec import LossSpec
 from beags_plugin.plugin.options.machine import check_machine, default_device
 from beags_plugin.plugin.options.model_options import BeagsModelConfig
-from beags_plugin.plugin.options.run_format import CONFIG_FILE, RUN_FORMAT, other_format
+from beags_plugin.plugin.options.relocated import place_for_nerfstudio
 from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+from beags_plugin.runs.run_config import BEGINNINGS, MOVED
 from beags_plugin.system.errors import UserError, print_user_errors_plainly, writing
 from beags_plugin.system.interrupts import stop
 from beags_plugin.system.lock import lock_ahead, run_lock
@@ -109,6 +113,13 @@ class BeagsTrainerConfig(TrainerConfig):
         """The folder (or transforms .json) that the run is trained on: --data, or the data parser's own."""
         return Path(self.data_config.data or self.data_config.dataparser.data)
 
+    def text_in(self, folder: Path) -> str:
+        """Return the config.yml of a run in ``folder`` that is made of this one."""
+        own = deepcopy(self)
+        for name, value in {**dict.fromkeys(BEGINNINGS), "run_dir": folder}.items():
+            setattr(own, name, value)
+        return config_text(own)
+
     def check(self) -> None:
         """Raise ``UserError`` for a value with which no training can run."""
         if self.max_num_iterations < 0:
@@ -180,10 +191,13 @@ def _read_by_nerfstudio(loader: yaml.constructor.SafeConstructor, node: yaml.Nod
     yield config
     assert isinstance(node, yaml.MappingNode)
     config.__setstate__(cast(dict[str, Any], loader.construct_mapping(node, deep=True)))
-    load("beags_plugin.plugin.runs.place:place_for_nerfstudio")(config)
+    place_for_nerfstudio(config)
 
 
 yaml.add_constructor(f"tag:yaml.org,2002:python/object:{__name__}.BeagsTrainerConfig", _read_by_nerfstudio, yaml.Loader)
+for _former, _kind in MOVED.items():
+    _build = partial(yaml.constructor.SafeConstructor.construct_yaml_object, cls=_kind)
+    yaml.add_constructor(f"tag:yaml.org,2002:python/object:{_former}", _build, yaml.Loader)
 
 
 def base_config() -> BeagsTrainerConfig:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from nerfstudio.models.base_model import ModelConfig
 from tyro.conf import Suppress
 
-from beags_plugin.plugin.options.scene_options import SceneOptions
+from beags_plugin.options.scene_options import SceneOptions
 from beags_plugin.system.registry import load
 
 

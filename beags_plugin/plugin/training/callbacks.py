@@ -9,7 +9,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from torch.optim import Adam
 
 from beags_plugin.core.cameras import camera_extent
-from beags_plugin.plugin.options.schedule import log_linear
+from beags_plugin.options.schedule import log_linear
 from beags_plugin.plugin.training.densifier import Densifier
 from beags_plugin.plugin.training.exposure import exposures_of_run
 from beags_plugin.plugin.training.monitor import Curves
@@ -18,7 +18,7 @@ from beags_plugin.plugin.training.refinement import RefinementSwitch
 from beags_plugin.plugin.training.resumable import TrainingRun
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
-from beags_plugin.plugin.views.held_out_views import HeldOutViews
+from beags_plugin.views.held_out_views import HeldOutViews
 
 SHARPENED = 0.5  # share of a refinement whose base has seen no close-ups
 

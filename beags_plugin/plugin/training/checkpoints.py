@@ -13,11 +13,11 @@ from torch.cuda.amp.grad_scaler import GradScaler
 
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.options.rollback import REPLACED
-from beags_plugin.plugin.runs.checkpoint_file import model_state, read_checkpoint
-from beags_plugin.plugin.runs.layout import REPORT_FILE, newest_checkpoint
-from beags_plugin.plugin.runs.write import save_atomically
 from beags_plugin.plugin.training.resumable import STATE, VERSION, Resumable, training_state
 from beags_plugin.plugin.training.scene_model import SceneModel
+from beags_plugin.runs.checkpoint_file import model_state, read_checkpoint
+from beags_plugin.runs.layout import REPORT_FILE, newest_checkpoint
+from beags_plugin.runs.write import save_atomically
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import reason
 

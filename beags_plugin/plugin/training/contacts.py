@@ -9,15 +9,15 @@ import torch
 from beags_plugin.core.densification import Densified
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export.base import Viewpoints
-from beags_plugin.export.closing_surfels import joined
-from beags_plugin.export.contact_faces import contact_faces
-from beags_plugin.export.mesh_options import MeshOptions
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
-from beags_plugin.preparation.own_training import Edit
+from beags_plugin.preparation.refiner_training import Edit
 from beags_plugin.rasterizers import make_rasterizer
+from beags_plugin.surfaces.closing_surfels import joined
+from beags_plugin.surfaces.contact_faces import contact_faces
+from beags_plugin.surfaces.item import Viewpoints
+from beags_plugin.surfaces.mesh_options import MeshOptions
 
 MOST_VIEWS = 30  # that are rendered for each object, at even distances
 RESOLUTION = 96  # voxels along an object's longest side

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.plugin.training.scene_model import SceneModel
-from beags_plugin.plugin.views.views import View
 from beags_plugin.rasterizers.rendering import surfel_inputs
+from beags_plugin.views.views import View
 
 MOST_VIEWS = 24  # rendered to measure the residuals
 LIMIT_DB = 8.0

@@ -10,18 +10,18 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.exposure import Exposures, Gains, gains, sightings
-from beags_plugin.export.baking import interpolated
-from beags_plugin.export.color import linear_from_srgb
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.losses.reduction import ordered_linear
-from beags_plugin.plugin.options.schedule import log_linear
+from beags_plugin.options.schedule import log_linear
 from beags_plugin.plugin.training.prepared_files import bar
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.plugin.views.dataparser import BeagsDataParser
-from beags_plugin.plugin.views.views import View, in_unit_range
+from beags_plugin.surfaces.baking import interpolated
+from beags_plugin.surfaces.color import linear_from_srgb
 from beags_plugin.system import processes
 from beags_plugin.system.progress import counted, say
+from beags_plugin.views.views import View, in_unit_range
 
 LEAST_SPREAD = 0.05  # EV; photos whose gains differ by less are taken to be of one exposure
 CERTAIN = 3.0  # times the noise of a gain, by which the photos' gains must differ to count as different

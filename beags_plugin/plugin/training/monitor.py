@@ -14,24 +14,24 @@ from nerfstudio.configs import base_config  # noqa: F401  (the writer, which it 
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from beags_plugin.core.select import select_class
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import mask_metrics
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView
 from beags_plugin.evaluation.run_metrics import MaskRenderer, psnr_after_fit
 from beags_plugin.evaluation.violations import boundary_errors, occupancy_violations
-from beags_plugin.extraction.select import select_class
 from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.labels.colors import colorize
 from beags_plugin.losses.photometric import psnr, ssim
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
-from beags_plugin.plugin.views.views import View
 from beags_plugin.rasterizers.rendering import render_class_map, surfel_inputs
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.memory import memory_mb, peak_memory_mb
 from beags_plugin.system.progress import counted, progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
+from beags_plugin.views.views import View
 
 MOST_CLASSES = 20  # with a curve and a picture each: the first ones by id
 CURVE = "held_out.json"

@@ -13,9 +13,9 @@ import torch
 from PIL import Image
 
 from beags_plugin.labels.classes import write_mask
-from beags_plugin.plugin.runs.prepared import PREPARATION_REPORT
 from beags_plugin.plugin.training.contradiction import Residuals
 from beags_plugin.preparation.pipeline import Preparation
+from beags_plugin.runs.prepared import PREPARATION_REPORT
 from beags_plugin.system import processes
 from beags_plugin.system.errors import writing
 from beags_plugin.system.memory import peak_memory_mb

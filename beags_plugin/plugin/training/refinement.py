@@ -16,9 +16,6 @@ from beags_plugin.assignment.assignment import Assignment
 from beags_plugin.core.membership import Membership
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.runs.layout import BASE_SNAPSHOT, PREPARED
-from beags_plugin.plugin.runs.prepared import prepared_labels, read_grid
-from beags_plugin.plugin.runs.write import write_run
 from beags_plugin.plugin.training.contacts import close_contacts
 from beags_plugin.plugin.training.contradiction import residuals
 from beags_plugin.plugin.training.prepared_files import bar, clear, save_prepared
@@ -26,9 +23,12 @@ from beags_plugin.plugin.training.resumable import TrainingRun
 from beags_plugin.plugin.training.scene_edits import apply_edit
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
-from beags_plugin.preparation.own_training import Edit, OwnTraining, TrainedScene
 from beags_plugin.preparation.pipeline import check_masks, prepare
+from beags_plugin.preparation.refiner_training import Edit, OwnTraining, TrainedScene
 from beags_plugin.refiners import make_refiner
+from beags_plugin.runs.layout import BASE_SNAPSHOT, PREPARED
+from beags_plugin.runs.prepared import prepared_labels, read_grid
+from beags_plugin.runs.write import write_run
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import counted
 

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from beags_plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
-from beags_plugin.plugin.options.schedule import PhaseSchedule
-from beags_plugin.plugin.runs.checkpoint_file import scene_alone
 from beags_plugin.plugin.training.optimizers import SceneOptimizer
 from beags_plugin.plugin.training.timing import StageSeconds
+from beags_plugin.runs.checkpoint_file import scene_alone
 from beags_plugin.system.errors import UserError
 
 STATE = "beags"  # key of a checkpoint, beside nerfstudio's own

@@ -7,7 +7,7 @@ from torch.optim import Adam
 
 from beags_plugin.core.densification import Densified
 from beags_plugin.plugin.training.scene_model import SceneModel
-from beags_plugin.preparation.own_training import Edit
+from beags_plugin.preparation.refiner_training import Edit
 
 
 def edit_scene(model: SceneModel, adam: Adam, edited: Densified) -> None:

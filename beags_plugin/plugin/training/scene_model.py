@@ -17,13 +17,13 @@ from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.base import Loss
 from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.options.scene_options import fixed_background
 from beags_plugin.plugin.options.model_options import BeagsModelConfig
-from beags_plugin.plugin.options.scene_options import fixed_background
-from beags_plugin.plugin.runs.checkpoint_file import exposures_of, extra_state
 from beags_plugin.plugin.training.timing import StepClock
-from beags_plugin.preparation.own_training import OwnTraining
+from beags_plugin.preparation.refiner_training import OwnTraining
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
+from beags_plugin.runs.checkpoint_file import exposures_of, extra_state
 
 PARAMETER_GROUPS = ("means", "features_dc", "features_rest", "opacities", "scales", "quats")
 FLATNESS = 1e-3  # exported third scale, relative to the smaller of the two: flat, yet no viewer divides by 0

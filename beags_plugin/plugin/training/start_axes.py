@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.extraction.frames import to_input_frame
+from beags_plugin.splat_io.frames import to_input_frame
 
 Measured = tuple[Surfels, dict[str, Any]]
 

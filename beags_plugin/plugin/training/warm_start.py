@@ -16,18 +16,18 @@ from torch import Tensor
 from beags_plugin.core.cameras import camera_extent
 from beags_plugin.core.flattening import flatten, without_empty_bands
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.extraction.far_worlds import double_means, origin_of
-from beags_plugin.extraction.frames import from_input_frame, to_input_frame
 from beags_plugin.importers.base import ImportedScene, read_scene
 from beags_plugin.losses.photometric import psnr
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.training.start_axes import turned_to_fit
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
-from beags_plugin.plugin.views.views import View
 from beags_plugin.rasterizers.rendering import surfel_inputs
+from beags_plugin.splat_io.far_worlds import double_means, origin_of
+from beags_plugin.splat_io.frames import from_input_frame, to_input_frame
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
+from beags_plugin.views.views import View
 
 START_REPORT = "start.json"  # file of a run that started from a scene: the scene, and how well it fits
 StartFrame = Literal["auto", "world", "normalised"]

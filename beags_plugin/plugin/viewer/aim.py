@@ -12,8 +12,8 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.export.frames import bounding_box
 from beags_plugin.pictures.orbit import OrbitFrame, orbit_frame
+from beags_plugin.surfaces.frames import bounding_box
 
 if TYPE_CHECKING:
     from viser import ClientHandle

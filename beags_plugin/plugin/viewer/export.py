@@ -60,7 +60,7 @@ class ShownFiles:
 
     def write(self, scale_by: str = "") -> Path:
         """Write the part, in the size that ``scale_by`` gives it; return the file. Raises ``UserError``."""
-        from beags_plugin.plugin.objects.export import export_shown
+        from beags_plugin.objects.export import export_shown
 
         viewing = self._viewing
         if viewing.run is None:

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.export.frames import Frame
 from beags_plugin.export.pose_options import check_length, scale_by_text
 from beags_plugin.plugin.viewer.picking import BUSY, PATIENCE, camera_along
 from beags_plugin.plugin.viewer.pointing import along
 from beags_plugin.plugin.viewer.viewing import Viewing
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
+from beags_plugin.surfaces.frames import Frame
 from beags_plugin.system.errors import UserError
 
 _APART = 4.0  # pixels of the page: nearer points are the same one, clicked twice

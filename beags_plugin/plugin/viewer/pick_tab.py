@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from beags_plugin.export import EXPORTERS
 from beags_plugin.labels.class_ids import BACKGROUND
+from beags_plugin.objects.picked_masks import masks_folder
 from beags_plugin.picking.cutter import ViewMarks
-from beags_plugin.plugin.objects.picked_masks import masks_folder
 from beags_plugin.plugin.viewer.clicks import SceneClicks
 from beags_plugin.plugin.viewer.export import ShownFiles
 from beags_plugin.plugin.viewer.legend import LegendRow, legend, pasteable, unique_labels, wrapped

@@ -15,15 +15,15 @@ from torch import Tensor
 
 from beags_plugin.core.membership import Membership
 from beags_plugin.labels.colors import colorize
+from beags_plugin.objects.picked_masks import save_masks
 from beags_plugin.picking.cutter import Cutter, takes_much
 from beags_plugin.picking.picks import Picks
-from beags_plugin.plugin.objects.picked_masks import save_masks
-from beags_plugin.plugin.runs.picked import with_picked, write_picked
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.viewer.choice import Visible
 from beags_plugin.plugin.viewer.legend import capitalised
 from beags_plugin.plugin.viewer.other_sides import sides_picture
 from beags_plugin.plugin.viewer.viewing import Paint, Viewing
+from beags_plugin.runs.picked import with_picked, write_picked
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
 

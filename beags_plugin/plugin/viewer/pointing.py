@@ -12,8 +12,8 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.masks.sources.cut import MARK
 from beags_plugin.picking.cutter import ViewMarks
-from beags_plugin.picking.source import MARK
 from beags_plugin.plugin.viewer.picking import camera_along
 from beags_plugin.system.errors import UserError
 

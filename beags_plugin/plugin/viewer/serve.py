@@ -13,9 +13,10 @@ from nerfstudio.scripts.viewer.run_viewer import _start_viewer
 
 from beags_plugin.plugin.options.config import base_config
 from beags_plugin.plugin.options.machine import default_device
-from beags_plugin.plugin.runs.checkpoint_file import model_state, read_checkpoint
-from beags_plugin.plugin.runs.layout import newest_checkpoint
-from beags_plugin.plugin.runs.place import check_data, open_for_training
+from beags_plugin.plugin.options.saved_config import open_for_training
+from beags_plugin.runs.checkpoint_file import model_state, read_checkpoint
+from beags_plugin.runs.layout import newest_checkpoint
+from beags_plugin.runs.relocation import check_data
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.options.config import BeagsTrainerConfig

@@ -8,17 +8,17 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from beags_plugin.export.frames import Frame
 from beags_plugin.export.pose_options import PoseOptions
-from beags_plugin.plugin.objects.pose import metres_per_unit
-from beags_plugin.plugin.runs.read import read_transform
-from beags_plugin.plugin.runs.run import Run
+from beags_plugin.objects.pose import metres_per_unit
 from beags_plugin.plugin.viewer.clicks import SceneClicks
 from beags_plugin.plugin.viewer.legend import capitalised, escaped
 from beags_plugin.plugin.viewer.measure import Measure, place_under
 from beags_plugin.plugin.viewer.pointing import WORLD, page_camera
 from beags_plugin.plugin.viewer.serving import another_tab, by_user
 from beags_plugin.plugin.viewer.viewing import Viewing
+from beags_plugin.runs.read import read_transform
+from beags_plugin.runs.run import Run
+from beags_plugin.surfaces.frames import Frame
 from beags_plugin.system.errors import UserError
 
 if TYPE_CHECKING:

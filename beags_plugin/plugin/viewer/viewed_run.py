@@ -15,10 +15,10 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.plugin.runs.layout import EXTRACTION_FILE, PREPARED, digest_of_prepared, files_digest, preparing_run
-from beags_plugin.plugin.runs.prepared import grid_state, read_grid
-from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
-from beags_plugin.plugin.views.views import unique_names
+from beags_plugin.runs.layout import EXTRACTION_FILE, PREPARED, digest_of_prepared, files_digest, preparing_run
+from beags_plugin.runs.prepared import grid_state, read_grid
+from beags_plugin.views.cameras import camera_from_nerfstudio
+from beags_plugin.views.views import unique_names
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.views.datamanager import BeagsDataManager

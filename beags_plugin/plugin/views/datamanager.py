@@ -21,21 +21,21 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.labels.label_maps import CompressedMap, to_compact, to_int32
-from beags_plugin.plugin.views.cameras import camera_from_nerfstudio, take_intrinsics
-from beags_plugin.plugin.views.close_ups import CloseUps
-from beags_plugin.plugin.views.data_options import ViewOptions
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.plugin.views.dataset import BeagsDataset
-from beags_plugin.plugin.views.dense_seeds import MOST_PHOTOS, with_dense_seeds
-from beags_plugin.plugin.views.focus import aim_by, focused
-from beags_plugin.plugin.views.objects_alone import objects_alone
-from beags_plugin.plugin.views.photo_files import PhotoFiles
-from beags_plugin.plugin.views.run_data import Split
-from beags_plugin.plugin.views.streaming import Lazy, StreamedViews
-from beags_plugin.plugin.views.views import View, unique_names
 from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
+from beags_plugin.views.cameras import camera_from_nerfstudio, take_intrinsics
+from beags_plugin.views.close_ups import CloseUps
+from beags_plugin.views.data_options import ViewOptions
+from beags_plugin.views.dense_seeds import MOST_PHOTOS, with_dense_seeds
+from beags_plugin.views.focus import aim_by, focused
+from beags_plugin.views.objects_alone import objects_alone
+from beags_plugin.views.photo_files import PhotoFiles
+from beags_plugin.views.run_data import Split
+from beags_plugin.views.streaming import Lazy, StreamedViews
+from beags_plugin.views.views import View, unique_names
 
 READ_AHEAD = 8  # streamed images that are read before their use
 OWN_KEYS = ("labels", "alpha")

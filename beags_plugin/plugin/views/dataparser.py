@@ -20,11 +20,11 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
-from beags_plugin.plugin.views.cameras import SceneCameras
-from beags_plugin.plugin.views.data_options import DataOptions
 from beags_plugin.plugin.views.ns_train import prepare
-from beags_plugin.plugin.views.scene_data import SceneData
 from beags_plugin.system.errors import print_user_errors_plainly
+from beags_plugin.views.cameras import SceneCameras
+from beags_plugin.views.data_options import DataOptions
+from beags_plugin.views.scene_data import SceneData
 
 
 @dataclass

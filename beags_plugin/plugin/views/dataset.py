@@ -6,7 +6,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
-from beags_plugin.plugin.views.split_photos import SplitPhotos
+from beags_plugin.views.split_photos import SplitPhotos
 
 
 class BeagsDataset(SplitPhotos, InputDataset):

@@ -10,8 +10,8 @@ import torch
 pytest.importorskip("nerfstudio")
 
 from beags_plugin.core.densification import DensifyConfig
-from beags_plugin.plugin.options.loss_spec import LossSpec
-from beags_plugin.plugin.options.schedule import PhaseSchedule, log_linear
+from beags_plugin.options.loss_spec import LossSpec
+from beags_plugin.options.schedule import PhaseSchedule, log_linear
 from beags_plugin.plugin.training.callbacks import camera_extent
 from beags_plugin.plugin.training.scene_edits import move_adam_state
 

@@ -24,10 +24,10 @@ from resumed_runs import (
 )
 from run_folders import CLASSES, write_scene
 
-from beags_plugin.export.contact_faces import ContactFaces
-from beags_plugin.plugin.objects.evaluate import evaluate_run
-from beags_plugin.plugin.runs.read import read_run
+from beags_plugin.objects.evaluate import evaluate_run
 from beags_plugin.plugin.training import contacts
+from beags_plugin.runs.read import read_run
+from beags_plugin.surfaces.contact_faces import ContactFaces
 
 CLOSE, OPEN = ({"pipeline.model.close_contacts": closed} for closed in (True, False))
 

@@ -112,7 +112,7 @@ def test_every_curve_and_picture_is_in_the_event_file(run):
 
 
 def test_the_last_iou_is_that_of_the_evaluation(run):
-    from beags_plugin.plugin.objects.evaluate import evaluate_run
+    from beags_plugin.objects.evaluate import evaluate_run
 
     metrics = evaluate_run(run / "config.yml").after
     events = events_of(run)
@@ -160,8 +160,8 @@ def test_a_resumed_run_has_the_iou_of_the_whole_one(data, run, tmp_path, monkeyp
 
 
 def test_a_bad_held_out_mask_leaves_out_curves_only(data, tmp_path, monkeypatch, capsys):
-    from beags_plugin.plugin.views.held_out_views import HeldOutViews
     from beags_plugin.system.errors import UserError
+    from beags_plugin.views.held_out_views import HeldOutViews
 
     def bad(self, index):
         raise UserError("the mask view.png has other proportions.")

@@ -28,24 +28,24 @@ from resumed_runs import (
 
 from beags_plugin.core.color_fit import apply_affine
 from beags_plugin.core.exposure import Exposures
-from beags_plugin.export.color import srgb_from_linear
-from beags_plugin.export.frames import Frame
-from beags_plugin.plugin.objects.evaluate import evaluate_run
-from beags_plugin.plugin.objects.extract import extract_objects
-from beags_plugin.plugin.objects.photos import _image, photos_of
-from beags_plugin.plugin.objects.shown import shown_scene
-from beags_plugin.plugin.options.schedule import PhaseSchedule
+from beags_plugin.objects.evaluate import evaluate_run
+from beags_plugin.objects.extract import extract_objects
+from beags_plugin.objects.photos import _image, photos_of
+from beags_plugin.objects.shown import shown_scene
+from beags_plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.presets import preset_config
-from beags_plugin.plugin.runs.picked import write_picked
-from beags_plugin.plugin.runs.read import read_run
-from beags_plugin.plugin.runs.run import Run
 from beags_plugin.plugin.training.exposure import GAMMA, RATES, PhotoExposures, exposures_of_run, photo_gains
 from beags_plugin.plugin.views.datamanager import BeagsDataManager, BeagsDataManagerConfig
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
-from beags_plugin.plugin.views.photo_files import PhotoFiles
+from beags_plugin.runs.picked import write_picked
+from beags_plugin.runs.read import read_run
+from beags_plugin.runs.run import Run
 from beags_plugin.sample.exposure import photo_gains as true_gains
 from beags_plugin.sample.writer import SampleConfig, write_sample
+from beags_plugin.surfaces.color import srgb_from_linear
+from beags_plugin.surfaces.frames import Frame
 from beags_plugin.system.errors import UserError
+from beags_plugin.views.photo_files import PhotoFiles
 
 SAMPLE = SampleConfig(width=56, height=42, num_train=10, num_test=2, num_points=600)
 EXPOSED = {"exposure": 1.5}

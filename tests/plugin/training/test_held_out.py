@@ -13,12 +13,12 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.exposure import Exposures
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.photometric import ssim
-from beags_plugin.plugin.options.schedule import PhaseSchedule
+from beags_plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.training.monitor import HeldOutCurve
-from beags_plugin.plugin.views.views import View
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs
+from beags_plugin.views.views import View
 
 CAMERA = Camera(torch.eye(4), torch.tensor([[30.0, 0, 12], [0, 30.0, 10], [0, 0, 1]]), 24, 20)
 

@@ -32,13 +32,13 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.normal import NormalConsistencyLoss
 from beags_plugin.losses.photometric import PhotometricLoss
-from beags_plugin.plugin.objects.evaluate import EvaluatedRun
+from beags_plugin.objects.evaluate import EvaluatedRun
 from beags_plugin.plugin.presets import preset_config
-from beags_plugin.plugin.runs.prepared import photos_contradict
-from beags_plugin.plugin.runs.read import raster_settings, read_run
-from beags_plugin.plugin.views.objects_alone import objects_alone, of_objects
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import surfel_inputs
+from beags_plugin.runs.prepared import photos_contradict
+from beags_plugin.runs.read import raster_settings, read_run
+from beags_plugin.views.objects_alone import objects_alone, of_objects
 
 # masks as they are: a pixel that the vote gives to an object would have the photo's say
 OPTIONS = {"pipeline.datamanager.photos": "objects", "pipeline.model.prepare.reprojection": "none",

@@ -28,14 +28,14 @@ from resumed_runs import (
 from run_folders import CLASSES, write_scene
 from viewer_windows import Window
 
-from beags_plugin.plugin.objects.evaluate import evaluate_run
-from beags_plugin.plugin.objects.export import export_run
-from beags_plugin.plugin.objects.extract import extract_objects
-from beags_plugin.plugin.runs.read import read_run
+from beags_plugin.objects.evaluate import evaluate_run
+from beags_plugin.objects.export import export_run
+from beags_plugin.objects.extract import extract_objects
 from beags_plugin.plugin.training import densifier
 from beags_plugin.plugin.training.scene_edits import edit_scene
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.refiners import REFINERS
+from beags_plugin.runs.read import read_run
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.ply import read_vertices
 
@@ -363,7 +363,7 @@ def test_a_run_says_that_its_refiner_did_not_end(data, tmp_path, capsys):
 
 
 def test_a_run_of_before_the_options_of_refiners_is_read(refined, tmp_path):
-    from beags_plugin.plugin.runs.run_config import load_run_config
+    from beags_plugin.plugin.options.saved_config import load_run_config
 
     lines = (refined("none") / "config.yml").read_text().splitlines()
     (tmp_path / "config.yml").write_text("\n".join(line for line in lines if "refiner_options" not in line))

@@ -23,8 +23,8 @@ from resumed_runs import (
     short_config,
 )
 
-from beags_plugin.plugin.runs.read import read_run
 from beags_plugin.plugin.trainer import BeagsTrainer
+from beags_plugin.runs.read import read_run
 from beags_plugin.system.errors import UserError
 
 LAST = sum(STEPS) - 1

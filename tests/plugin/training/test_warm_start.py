@@ -14,8 +14,8 @@ pytest.importorskip("nerfstudio")
 
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.extraction.ply import write_ply
 from beags_plugin.plugin.presets import preset_config
+from beags_plugin.splat_io.ply import write_ply
 from beags_plugin.system.errors import UserError
 
 
@@ -139,9 +139,9 @@ def test_a_wrong_frame_is_reported_with_the_figure_and_the_frame_that_fits(scene
 def test_refinement_starts_from_a_ply_and_does_not_need_it_later(scene, tmp_path):
     from nerfstudio.utils.eval_utils import eval_setup
 
-    from beags_plugin.plugin.objects.evaluate import EvaluatedRun
-    from beags_plugin.plugin.objects.extract import extract_objects
-    from beags_plugin.plugin.runs.launch import train
+    from beags_plugin.objects.evaluate import EvaluatedRun
+    from beags_plugin.objects.extract import extract_objects
+    from beags_plugin.plugin.launch import train
 
     ply, run = tmp_path / "scene.ply", tmp_path / "run"
     write_ply(ply, scene.surfels, layout="2dgs")
@@ -162,7 +162,7 @@ def test_refinement_starts_from_a_ply_and_does_not_need_it_later(scene, tmp_path
 
 
 def test_base_steps_polish_a_scene_without_growth(scene, tmp_path):
-    from beags_plugin.plugin.runs.launch import train
+    from beags_plugin.plugin.launch import train
 
     run = tmp_path / "run"
     start = write_splatfacto(tmp_path / "theirs", scene.surfels, (torch.eye(4)[:3], 1.0))

@@ -26,14 +26,11 @@ from clicked_pages import VIEW, click_on, page, position
 from run_folders import ring_cameras
 from viewer_windows import Window
 
-from beags_plugin.extraction.ply import read_ply, write_ply
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.labels.colors import colorize
-from beags_plugin.plugin.objects.export import export_run
-from beags_plugin.plugin.objects.extract import extract_objects
-from beags_plugin.plugin.objects.picked_masks import option_words
-from beags_plugin.plugin.runs.picked import PICKED_FILE
-from beags_plugin.plugin.runs.read import read_run, read_transform
+from beags_plugin.objects.export import export_run
+from beags_plugin.objects.extract import extract_objects
+from beags_plugin.objects.picked_masks import option_words
 from beags_plugin.plugin.viewer.legend import pasteable
 from beags_plugin.plugin.viewer.other_sides import other_sides
 from beags_plugin.plugin.viewer.pick_work import FIRST_COLOR
@@ -41,6 +38,9 @@ from beags_plugin.plugin.viewer.pointing import page_camera
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs
+from beags_plugin.runs.picked import PICKED_FILE
+from beags_plugin.runs.read import read_run, read_transform
+from beags_plugin.splat_io.ply import read_ply, write_ply
 from beags_plugin.system.errors import UserError
 
 
@@ -373,8 +373,8 @@ def test_an_extracted_run_is_corrected_and_drawn_and_the_run_that_it_is_from_sta
 
 def test_objects_of_another_programs_scene_are_picked(opened, tmp_path):
     """A .ply of 3D Gaussians in no order of ours, of which ``beags-base`` made a run."""
+    from beags_plugin.plugin.launch import train
     from beags_plugin.plugin.presets import preset_config
-    from beags_plugin.plugin.runs.launch import train
 
     lab, ply, run = write_solids(tmp_path / "lab"), tmp_path / "scene.ply", tmp_path / "run"
     surfels, order = solids(COLOURED)[0], torch.randperm(len(OWNER), generator=torch.Generator().manual_seed(0))

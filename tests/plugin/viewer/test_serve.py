@@ -14,7 +14,7 @@ pytest.importorskip("nerfstudio")
 
 from beags_plugin.commands import cli
 from beags_plugin.plugin.options.config import config_text
-from beags_plugin.plugin.runs.place import open_for_training
+from beags_plugin.plugin.options.saved_config import open_for_training
 from beags_plugin.plugin.viewer import serve
 from beags_plugin.system.errors import UserError
 

@@ -18,11 +18,11 @@ from nerfstudio.viewer.viewer_elements import ViewerClick
 from viewer_windows import ALWAYS, Window, write_finished
 
 from beags_plugin.core.membership import Membership
-from beags_plugin.extraction.ply import read_ply
 from beags_plugin.labels.colors import colorize
 from beags_plugin.plugin.viewer.choice import Choice
 from beags_plugin.plugin.viewer.viewed_run import ViewedRun
 from beags_plugin.plugin.viewer.viewing import CHANNELS
+from beags_plugin.splat_io.ply import read_ply
 
 
 @pytest.fixture(scope="module")

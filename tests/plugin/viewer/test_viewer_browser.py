@@ -11,7 +11,7 @@ pytest.importorskip("nerfstudio")
 from browser import NEEDED, Page
 from viewer_pages import COLORS, HEIGHT, WIDTH, awaited, differing, painted, slid, varied, viewed
 
-from beags_plugin.extraction.ply import read_ply
+from beags_plugin.splat_io.ply import read_ply
 
 pytestmark = NEEDED
 OUTPUTS = (

@@ -15,8 +15,8 @@ pytest.importorskip("nerfstudio")
 from browser import NEEDED, Page
 from viewer_pages import HEIGHT, WIDTH, awaited, differing, free_port, painted, picture, started, varied, viewed
 
-from beags_plugin.extraction.ply import read_ply, write_ply
-from beags_plugin.plugin.objects.extract import extract_objects
+from beags_plugin.objects.extract import extract_objects
+from beags_plugin.splat_io.ply import read_ply, write_ply
 
 pytestmark = NEEDED
 STEPS = 60, 240  # of base and refinement

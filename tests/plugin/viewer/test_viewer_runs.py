@@ -17,7 +17,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from viewer_windows import ALWAYS, Stand, write_finished
 
 from beags_plugin.labels.classes import write_mask
-from beags_plugin.plugin.objects.extract import extract_objects
+from beags_plugin.objects.extract import extract_objects
 from beags_plugin.plugin.viewer.viewing import CHANNELS
 from beags_plugin.system.errors import UserError
 

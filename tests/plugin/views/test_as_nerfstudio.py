@@ -18,12 +18,12 @@ from nerfstudio.data.utils import colmap_parsing_utils as colmap
 from nerfstudio.process_data.colmap_utils import parse_colmap_camera_params
 
 from beags_plugin.data.frame_cameras import LENS
-from beags_plugin.plugin.views.cameras import CAMERA_TYPES, FISHEYE, PERSPECTIVE, SceneCameras, intrinsics
-from beags_plugin.plugin.views.colmap_files import colmap_cameras
-from beags_plugin.plugin.views.colmap_model import read_cameras, rotation_of
 from beags_plugin.plugin.views.dataparser import nerfstudio_cameras
-from beags_plugin.plugin.views.lens import straighten, undistort_image
-from beags_plugin.plugin.views.orientation import oriented
+from beags_plugin.views.cameras import CAMERA_TYPES, FISHEYE, PERSPECTIVE, SceneCameras, intrinsics
+from beags_plugin.views.colmap_files import colmap_cameras
+from beags_plugin.views.colmap_model import read_cameras, rotation_of
+from beags_plugin.views.lens import straighten, undistort_image
+from beags_plugin.views.orientation import oriented
 
 
 def poses(seed: int, flat: bool = False) -> torch.Tensor:

@@ -13,8 +13,8 @@ from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_imag
 
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
-from beags_plugin.plugin.views.lens import undistort_labels
-from beags_plugin.plugin.views.views import unique_names
+from beags_plugin.views.lens import undistort_labels
+from beags_plugin.views.views import unique_names
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "equidistant"])

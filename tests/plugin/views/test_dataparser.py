@@ -25,10 +25,10 @@ from data_folders import (
 from parsed_views import AS_GIVEN, names, parse, pixel, real
 from rich.console import Console
 
-from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.system.progress import progress_bar
+from beags_plugin.views.cameras import camera_from_nerfstudio
 
 
 def test_what_it_says_stands_above_a_bar_not_on_it(tmp_path, monkeypatch):
@@ -202,7 +202,7 @@ def test_random_points_lie_in_common_view(tmp_path, kind):
 def test_fruit_reprojects_and_its_masks_fit():
     from nerfstudio.data.utils.colmap_parsing_utils import read_points3D_binary
 
-    from beags_plugin.plugin.views.colmap_files import read_features
+    from beags_plugin.views.colmap_files import read_features
 
     root = real("fruit")
     outputs = parse(root)

@@ -20,9 +20,9 @@ from parsed_views import parse
 from PIL import Image
 
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.system.errors import UserError
+from beags_plugin.views.cameras import camera_from_nerfstudio
 
 # --- masks --------------------------------------------------------------------------------------------------------
 

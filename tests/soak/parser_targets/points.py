@@ -12,7 +12,7 @@ from parser_targets.target import Target, folder
 
 def _splats(path: Path) -> None:
     from beags_plugin.core.flattening import flatten
-    from beags_plugin.extraction.splat_file import read_splat_file
+    from beags_plugin.splat_io.splat_file import read_splat_file
 
     gaussians = read_splat_file(path).gaussians
     usable = gaussians.usable()
@@ -27,7 +27,7 @@ def _points(path: Path) -> None:
 
 
 def _ply_files() -> list[bytes]:
-    from beags_plugin.extraction.ply import write_ply
+    from beags_plugin.splat_io.ply import write_ply
 
     surfels = Surfels(
         torch.zeros(2, 3), torch.ones(2, 4), torch.zeros(2, 2), torch.zeros(2), torch.zeros(2, 3), torch.zeros(2, 3, 3)

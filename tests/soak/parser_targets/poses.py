@@ -26,8 +26,8 @@ def _dtu(path: Path) -> None:
 
 
 def _colmap(path: Path) -> object:
-    from beags_plugin.plugin.views.colmap_files import read_colmap_points
-    from beags_plugin.plugin.views.colmap_model import read_cameras, read_images
+    from beags_plugin.views.colmap_files import read_colmap_points
+    from beags_plugin.views.colmap_model import read_cameras, read_images
 
     return {"points3D": read_colmap_points, "cameras": read_cameras, "images": read_images}[path.name.split(".")[0]](
         path
@@ -36,8 +36,8 @@ def _colmap(path: Path) -> object:
 
 def _transforms(path: Path) -> None:
     from beags_plugin.data.dataset import TransformsFile
-    from beags_plugin.plugin.views.cameras import check_cameras
-    from beags_plugin.plugin.views.poses import Normalization, read_poses
+    from beags_plugin.views.cameras import check_cameras
+    from beags_plugin.views.poses import Normalization, read_poses
 
     pictures()
     views = read_poses(TransformsFile(path), path.parent, Normalization("up", "poses", True, 1.0, 1.0))

@@ -16,8 +16,8 @@ from parser_targets.target import Target
 
 def _checkpoint(path: Path) -> None:
     from beags_plugin.importers.checkpoint import _gaussians
-    from beags_plugin.plugin.runs.checkpoint_file import read_checkpoint, validate
     from beags_plugin.plugin.training.resumable import training_state
+    from beags_plugin.runs.checkpoint_file import read_checkpoint, validate
 
     try:
         state = read_checkpoint(path)
@@ -29,7 +29,7 @@ def _checkpoint(path: Path) -> None:
 
 
 def _grid(path: Path) -> None:
-    from beags_plugin.plugin.runs.prepared import read_grid
+    from beags_plugin.runs.prepared import read_grid
 
     read_grid(path)
 

@@ -38,7 +38,7 @@ def _experiment(path: Path) -> None:
 
 
 def _config(path: Path) -> None:
-    from beags_plugin.plugin.runs.run_config import load_run_config
+    from beags_plugin.plugin.options.saved_config import load_run_config
 
     load_run_config(path)
 

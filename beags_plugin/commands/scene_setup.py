@@ -1,0 +1,175 @@
+"""What ``beags demo`` makes of photos before it trains: poses where there are none, masks where there are none."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from contextlib import nullcontext
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from rich.console import Console
+
+from beags_plugin.commands.made_masks import MADE, as_made, check_source, made_masks
+from beags_plugin.commands.process import find_poses
+from beags_plugin.data.layout import fitting_layouts, read_dataset
+from beags_plugin.masks.sources.base import NothingFound
+from beags_plugin.posing.files import MODEL
+from beags_plugin.posing.photos import check_photos, find_photos, with_masks
+from beags_plugin.posing.process import REPORT, NothingFits
+from beags_plugin.posing.turned import ENOUGH, objects_seem_turned, poses_are_their_own
+from beags_plugin.posing.video import is_video
+from beags_plugin.system.digests import content_digest, folder_digest
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import progress_bar
+from beags_plugin.system.whole_files import write_text_atomically
+
+CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
+MADE_OF = "made_of.json"  # in the scene: the path of its photos
+POSES = ("transforms*.json", "cameras.*", "*/cameras.*")  # of a scene that lacks something, not of photos alone
+
+
+@dataclass(frozen=True)
+class MadeScene:
+    """A scene to train on: its folder, and the folder that holds masks/ and classes.json if it is another.
+
+    turned: the objects turned while the room stood, and the poses are theirs.
+    """
+
+    data: Path
+    labels: Path | None = None
+    turned: bool = False
+
+    @property
+    def made_masks(self) -> Path | None:
+        """Return the folder of masks that a network made and nobody mended; None for others."""
+        folder = self.labels or self.data
+        return folder / "masks" if as_made(folder) else None
+
+    def options(self) -> list[str]:
+        """Return the options of ``beags-data`` that name its masks."""
+        if self.labels is None:
+            return []
+        masks, classes = self.labels.absolute() / "masks", self.labels.absolute() / "classes.json"
+        return ["--masks-path", str(masks), *(["--classes-path", str(classes)] if classes.exists() else [])]
+
+    def digests(self, output: Path) -> list[str]:
+        """Digest the files of the scene, but what the demo wrote into ``output``, where that lies in the scene."""
+        inside = self.data.resolve().is_relative_to(output.resolve())
+        found = [folder_digest(self.data, without=None if inside else output)]
+        if self.labels is not None:
+            classes = self.labels / "classes.json"
+            found += [folder_digest(self.labels / "masks"), content_digest([classes] if classes.exists() else [])]
+        return found
+
+
+def name_of(data: Path) -> str:
+    """Return what the outputs of a scene, photos or a video are called; ``images`` alone would name nothing."""
+    folder = data.resolve()
+    return folder.stem if data.is_file() else folder.parent.name if folder.name == "images" else folder.name
+
+
+def made_scene(data: Path, output: Path) -> MadeScene:
+    """Return the scene in ``data``, or one made below ``output`` of photos without poses, or without masks.
+
+    data: a scene, a folder of photos (or with images/, perhaps masks/), or a video. What an earlier call made of the
+    same photos is taken as it is; masks also where the user has mended them. Raises ``UserError``; where masks cannot
+    be made, before poses are computed.
+    """
+    if data.is_dir() and (fitting_layouts(data) or any(any(data.glob(pattern)) for pattern in POSES)):
+        read_dataset(data)  # says what lacks or is too much
+        if _has_masks(data):
+            return MadeScene(data)
+        check_source()
+        return MadeScene(data, made_masks(data, output / "made"))
+    found = [] if is_video(data) else find_photos(data)  # says what is wrong with them before anything is fetched
+    given = data if any((data / "masks").rglob("*.png")) else None
+    scene = output / "scene"
+    _check_other(data, scene)
+    if given is None:
+        check_source()
+    elif find_spec("pycolmap") is not None:  # else the next step says so
+        with_masks(check_photos(found, scene / "images", progress_bar), given / "masks")
+    CONSOLE.print(f"{data} has no poses, so they are computed from the photos.")
+    own = None
+    try:
+        _print_poses(data, scene)
+    except NothingFits as error:
+        CONSOLE.print("The photos as a whole give no poses, so poses of the objects alone are tried.")
+        if (own := _scene_of_objects(scene, output / "turned", given, room=False)) is None:
+            raise error
+    if not (scene / MADE_OF).exists():
+        write_text_atomically(json.dumps(str(data.resolve())), scene / MADE_OF)
+    if own is not None:
+        return own
+    if given is not None and (scene / MADE).exists():
+        (scene / "classes.json").unlink(missing_ok=True)  # of masks that were made when none were given
+    labels = given or made_masks(scene, scene)
+    if objects_seem_turned(scene / MODEL, (labels or scene) / "masks"):
+        CONSOLE.print(
+            "The poses explain few of the objects' features, as if the objects had turned before a room that stands: "
+            "poses of the objects alone are tried."
+        )
+        own = _scene_of_objects(scene, output / "turned", given, room=True)
+    return own or MadeScene(scene, labels)
+
+
+def _print_poses(data: Path, scene: Path, masks: Path | None = None) -> None:
+    for line in find_poses(data, scene, nullcontext(), masks):
+        CONSOLE.print(line)
+
+
+def _scene_of_objects(scene: Path, folder: Path, given: Path | None, room: bool) -> MadeScene | None:
+    """Make a scene in ``folder`` with poses from the objects' features alone.
+
+    scene: with the photos. given: the folder that holds the user's masks/. room: whether ``scene`` has poses of the
+    whole photos. Returns None, and says why, where the objects show too little for poses, or moved as the room did.
+    """
+    labels, photos = given or folder / "labels", scene / "images"
+    try:
+        if given is None:
+            _all_masks(photos, labels, scene / "masks" if room else None)
+        _print_poses(photos, folder, labels / "masks")
+    except (NothingFits, NothingFound) as error:
+        CONSOLE.print(f"There are no poses of the objects alone: {error}")
+        return None
+    posed = json.loads((folder / REPORT).read_text(encoding="utf-8"))
+    enough = posed["registered"] >= ENOUGH * posed["photos"]
+    if not (poses_are_their_own(folder / MODEL, scene / MODEL, labels / "masks") if room else enough):
+        kept = f"the poses in {scene} stay" if room else "they are not taken"
+        CONSOLE.print(
+            f"Those of the objects alone are too few, or no better, so {kept}. If the objects did turn, take more "
+            "photos of them, or put masks of all that turned into masks/ beside the photos."
+        )
+        return None
+    CONSOLE.print("Poses and training are of the objects alone, as they turned before a room that stands.")
+    return MadeScene(folder, labels, turned=True)
+
+
+def _all_masks(photos: Path, labels: Path, mended: Path | None) -> None:
+    """Make masks of all photos, of held-out ones too, as their poses need them; those in ``mended`` go before."""
+    made_masks(photos, labels)
+    for mask in sorted(mended.glob("*.png")) if mended is not None else ():
+        same = labels / "masks" / mask.name
+        if not same.exists() or same.read_bytes() != mask.read_bytes():
+            shutil.copyfile(mask, same)
+
+
+def _check_other(data: Path, scene: Path) -> None:
+    """Raise ``UserError`` if a scene was made of other photos."""
+    try:
+        former = json.loads((scene / MADE_OF).read_text())
+    except (OSError, ValueError):
+        return
+    if former != str(data.resolve()):
+        raise UserError(f"{scene} was made of {former}: give another --output for {data}.")
+
+
+def _has_masks(data: Path) -> bool:
+    from beags_plugin.views.data_options import DataOptions
+    from beags_plugin.views.scene_data import SceneData
+
+    parser = SceneData(DataOptions(data=data))
+    masks, folder, _ = parser.mask_files(*parser.posed_views())
+    return any(masks) or any(folder.glob("**/*.png"))  # training says what is wrong with their names

@@ -1,0 +1,1 @@
+"""What is done to a finished run: extract, export, evaluate, render, masks, pose; without nerfstudio."""

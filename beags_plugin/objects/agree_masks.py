@@ -1,0 +1,96 @@
+"""Masks that agree in space, by the Gaussians of a trained run: ``beags masks agree``."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import torch
+
+from beags_plugin.labels.classes import write_mask
+from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
+from beags_plugin.masks.agreement import AgreedMask
+from beags_plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
+from beags_plugin.pictures.masks import Changed, before_and_after
+from beags_plugin.preparation.agreed import agree
+from beags_plugin.preparation.pipeline import check_masks, known_classes
+from beags_plugin.runs.read import SavedScene
+from beags_plugin.runs.run import Run
+from beags_plugin.system.errors import writing
+from beags_plugin.system.pasted import command, quoted
+from beags_plugin.system.progress import counted, progress_bar
+from beags_plugin.views.data_options import DataOptions
+
+FOLDER = "agreed"  # beside config.yml
+PICTURES = 6  # views in doubt.png
+IN_DOUBT, CHANGED, AS_GIVEN = 0, 128, 255  # grey values in its last column
+LEGEND = "black: in doubt, grey: changed"
+
+
+def agree_masks(config_path: Path, options: ReprojectionOptions, output: Path | None = None) -> list[str]:
+    """Write masks of all training views that agree, classes.json, report.json and doubt.png; return lines for users.
+
+    config_path: config.yml of any run, trained with or without masks. options: of the data; those of reprojection are
+    not used. output: the folder; ``agreed`` beside config.yml if None. Raises ``UserError`` for a run or data that
+    cannot be used, and if no mask of a training view names an object.
+    """
+    run = Run(config_path, options.data)
+    scene, manager = run.scene, data_to_reproject(run, options)
+    views, files = manager.views("train"), manager.files["train"]
+    with progress_bar("Reading masks", passing=True) as progress:
+        given = LabelMaps(view.labels for view in counted(views, len(views), progress))
+    check_masks(given)
+    classes = manager.train_dataset.metadata["classes"]
+    shown = CompressedMaps()
+
+    def pixels(view: int) -> np.ndarray:
+        return (255.0 * views[view].image + 0.5).to(torch.uint8).cpu().numpy()
+
+    def take(view: int, mask: AgreedMask) -> None:
+        value = torch.full_like(mask.labels, AS_GIVEN, dtype=torch.uint8)
+        shown.append(value.masked_fill(mask.changed, CHANGED).masked_fill(mask.doubtful, IN_DOUBT))
+
+    labels, report = agree(
+        scene.surfels().detach(), [view.camera for view in views], given, known_classes(given, classes),
+        run.rasterizer, run.settings, progress_bar,
+        1 if options.run_size else max(1, round(_downscale(scene))),
+        [partial(pixels, view) for view in range(len(views))], take,
+    )  # fmt: skip
+    names, output = [view.name for view in views], output or config_path.parent / FOLDER
+    with writing(output):
+        for index, path in enumerate(mask_paths(manager.train_dataset.image_filenames)):
+            (output / "masks" / path).parent.mkdir(parents=True, exist_ok=True)
+            write_mask(output / "masks" / path, files.as_in_file(labels[index].numpy().astype(np.uint16), index))
+        (output / "classes.json").write_text(json.dumps({str(i): name for i, name in classes.items()}, indent=1))
+        (output / "report.json").write_text(json.dumps(report.to_json(names), indent=1))
+        touched = np.add(report.changed, report.doubtful)
+        order = [int(view) for view in np.argsort(-touched, kind="stable")[:PICTURES] if touched[view] > 0]
+        pictured = []
+        for view in order:
+            before = given[view]
+            before = None if before is None else before.numpy()
+            pictured.append(Changed(names[view], pixels(view), before, labels[view].numpy(), shown[view].numpy()))
+        (output / "doubt.png").unlink(missing_ok=True)
+        if pictured:
+            before_and_after(output / "doubt.png", pictured, LEGEND)
+    written = ("masks", "report.json", *(["doubt.png"] if pictured else []))
+    said = [f"{report.sentence(names)}.", *(str(output / name) for name in written)]
+    return [*said, f"Next: {_refinement(scene, output.absolute())}"]
+
+
+def _downscale(scene: SavedScene) -> float:
+    """Return how much larger the photos are than what the run was trained on."""
+    data = scene.config.data_config
+    parser = cast(DataOptions, data.dataparser)
+    return (parser.downscale_factor or 1.0) / data.camera_res_scale_factor
+
+
+def _refinement(scene: SavedScene, output: Path) -> str:
+    """Return the command that refines the run with the masks in ``output``."""
+    config = scene.config
+    words = ["ns-train", config.method_name, "--data", config.data_path, "--load-dir", config.get_checkpoint_dir(),
+             "beags-data", "--downscale-factor", f"{_downscale(scene):g}"]  # fmt: skip
+    return f"{command(words)} --masks-path {quoted(output / 'masks')} --classes-path {quoted(output / 'classes.json')}"

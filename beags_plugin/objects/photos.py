@@ -1,0 +1,94 @@
+"""The photos of an object of a run, for textures: the part of each that shows it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera, cropped
+from beags_plugin.core.lifting import project
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.objects.shown import ShownScene
+from beags_plugin.surfaces.frames import Frame, bounding_box
+from beags_plugin.surfaces.item import Photo
+
+_AROUND = 0.1  # A crop shows this share of the object's box beside it too.
+_MARGIN = 8  # pixels more
+_KEPT = 200_000_000  # bytes of an object's photos, masks and depths that stay in memory
+
+Box = tuple[int, int, int, int]
+"""Left, top, right and bottom, pixels; right and bottom are excluded."""
+
+
+class _Kept:
+    """Tensors that are made when they are first asked for, and kept while all take at most ``_KEPT`` bytes."""
+
+    def __init__(self) -> None:
+        self._values: dict[tuple[str, int], Tensor] = {}
+        self._bytes = 0
+
+    def get(self, name: str, view: int, make: Callable[[], Tensor]) -> Tensor:
+        if (found := self._values.get((name, view))) is not None:
+            return found
+        made = make()
+        size = made.numel() * made.element_size()
+        if self._bytes + size <= _KEPT:
+            self._bytes += size
+            self._values[name, view] = made = made.clone()  # a part would keep all of its picture
+        return made
+
+
+def photos_of(shown: ShownScene, class_id: int | None, part: Surfels, frame: Frame) -> Sequence[Photo]:
+    """Return the photos of a class (None: of all of them) in ``frame``; images, masks and depth are read when used.
+
+    part: its Gaussians, in the run's frame. Photos are cropped to its box, and those that lack it left out.
+    """
+    kept, found = _Kept(), []
+    low, high = bounding_box(part)
+    reach = _AROUND * (high - low)
+    corners = torch.cartesian_prod(*torch.stack([low - reach, high + reach], dim=1).double())
+    for view, camera in enumerate(shown.views.cameras):
+        box = _box(camera, corners) if class_id is not None else (0, 0, camera.width, camera.height)
+        if box is None:
+            continue
+        left, top, right, bottom = box
+        there = slice(top, bottom), slice(left, right)
+        image = partial(kept.get, "image", view, partial(_image, shown, view, there))
+        own = partial(kept.get, "own", view, partial(_own, shown, view, class_id, there))
+        depth = partial(kept.get, "depth", view, partial(_depth, shown, view, frame.scale, there))
+        found.append(Photo(frame.camera(cropped(camera, left, top, right - left, bottom - top)), image, own, depth))
+    return found
+
+
+def _box(camera: Camera, corners: Tensor) -> Box | None:
+    """Return where a view shows a box of 8 corners [8, 3]; all of the view from within, None if it does not."""
+    xy, z = project(corners, camera.to(torch.float64))
+    if bool((z <= 0).all()):
+        return None
+    if bool((z <= 0).any()):
+        return 0, 0, camera.width, camera.height
+    (left, top), (right, bottom) = (xy.amin(dim=0) - _MARGIN).tolist(), (xy.amax(dim=0) + _MARGIN).tolist()
+    left, top = max(0, math.floor(left)), max(0, math.floor(top))
+    right, bottom = min(camera.width, math.ceil(right)), min(camera.height, math.ceil(bottom))
+    return (left, top, right, bottom) if left < right and top < bottom else None
+
+
+def _image(shown: ShownScene, view: int, there: tuple[slice, slice]) -> Tensor:
+    """Return a photo [H, W, 3] in the exposure of the scene."""
+    image = shown.photos[view].image.cpu()[there]
+    return image if shown.exposures is None else shown.exposures.evened(image, shown.names[view])
+
+
+def _own(shown: ShownScene, view: int, class_id: int | None, there: tuple[slice, slice]) -> Tensor:
+    """Return the pixels [H, W] bool of a class; evened exposures make grey of burnt-out ones, so these are left out."""
+    labels = shown.views.labels[view].cpu()[there]
+    own = torch.ones_like(labels, dtype=torch.bool) if class_id is None else labels == class_id
+    return own if shown.exposures is None else own & (shown.photos[view].image.cpu()[there] < 1.0).any(dim=2)
+
+
+def _depth(shown: ShownScene, view: int, scale: float, there: tuple[slice, slice]) -> Tensor:
+    return shown.views.depths[view].cpu()[there] / scale

@@ -1,0 +1,106 @@
+"""Masks of objects that were picked in the viewer, so that refinement makes them clean."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from beags_plugin.core.membership import Membership
+from beags_plugin.labels.class_ids import BACKGROUND
+from beags_plugin.masks.sources.cut import DrawnSource
+from beags_plugin.objects.check_masks import options_beside
+from beags_plugin.objects.make_masks import make_masks
+from beags_plugin.runs.relocation import open_run
+from beags_plugin.system.digests import content_digest
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.pasted import command
+from beags_plugin.system.whole_files import write_text_atomically
+from beags_plugin.views.data_options import DataOptions
+
+STAMP = "masks_picked.txt"  # beside masks that were picked: a digest of them, which shows whether they were mended
+FOLDER = "picked"  # in the run, for masks that must not replace the scene's
+
+
+@dataclass(frozen=True)
+class SavedMasks:
+    """Masks that were written: sentences on where, and the command that refines with them."""
+
+    said: str
+    command: str
+
+
+def masks_folder(run: Path) -> Path:
+    """Return the folder beside a run that takes its next masks: ``picked``, or ``picked_2`` and so on.
+
+    A folder with masks that were not written by ``save_masks``, or have been changed since, is left alone.
+    """
+    numbers = range(2, 1000)
+    return next((place for place in [run / FOLDER, *(run / f"{FOLDER}_{n}" for n in numbers)] if _free(place)), run)
+
+
+def save_masks(
+    config_path: Path, members: Membership, names: Mapping[int, str], folder: Path | None = None
+) -> SavedMasks:
+    """Write masks of all training views, classes.json and made.png.
+
+    config_path: of the run. members: of its Gaussians. folder: for the masks; that of ``masks_folder`` if None. Raises
+    ``UserError`` if there is no object, where files cannot be written, and for a folder with masks that were not
+    written here, or have been changed since.
+    """
+    if not any(class_id != BACKGROUND for class_id in members.present()):
+        raise UserError("nothing has been picked yet: click on an object first.")
+    run, data = config_path.parent, options_beside(config_path, None)
+    scene = Path(data.data).absolute()
+    scene = scene if scene.is_dir() else scene.parent
+    folder = masks_folder(run) if folder is None else folder.absolute()
+    if folder == run or not _free(folder):
+        raise UserError(f"{folder} holds masks that were not written here, or have been changed: name another folder.")
+    again = _holds_masks(folder)
+    make_masks(data, DrawnSource(members, names), config_path, folder, overwrite=again)
+    write_text_atomically(_digest(folder), folder / STAMP)
+    config = open_run(config_path)
+    said = f"{'Replaced' if again else 'Saved'} {folder / 'masks'} and classes.json; look at {folder / 'made.png'}."
+    photos = config.data_config.photos
+    own: dict[str, Any] = {"masks_path": None, "classes_path": Path("classes.json"), "ignore_ids": ()}
+    if folder != scene:
+        own |= {"masks_path": folder / "masks", "classes_path": folder / "classes.json"}
+    words = [
+        "ns-train", "beags-refine", "--data", str(data.data), "--load-dir", str(config.get_checkpoint_dir().absolute()),
+        *([] if photos == "all" else ["--pipeline.datamanager.photos", photos]),
+        *option_words(replace(data, **own)),
+    ]  # fmt: skip
+    return SavedMasks(said, command(words))
+
+
+def option_words(parser: DataOptions) -> list[str]:
+    """Return the options of ``beags-data`` that make a data parser, as words of a command; none for the usual ones.
+
+    Those that the command line does not offer are left out.
+    """
+    usual, words = DataOptions(), []
+    for field in fields(parser):
+        value = getattr(parser, field.name)
+        hidden = str(field.type).startswith("Suppress") or field.name in ("_target", "data")
+        if not hidden and value != getattr(usual, field.name):
+            parts = [str(each) for each in value] if isinstance(value, (list, tuple)) else [str(value)]
+            words += [f"--{field.name.replace('_', '-')}", *parts]
+    return ["beags-data", *words] if words else []
+
+
+def _holds_masks(folder: Path) -> bool:
+    return any((folder / "masks").rglob("*.png")) or (folder / "classes.json").exists()
+
+
+def _free(folder: Path) -> bool:
+    """Return whether a folder has no masks, or those that were written here, as they were."""
+    if not _holds_masks(folder):
+        return True
+    stamp = folder / STAMP
+    return stamp.exists() and stamp.read_text() == _digest(folder)
+
+
+def _digest(folder: Path) -> str:
+    files = sorted((folder / "masks").rglob("*.png"))
+    return content_digest([folder / "classes.json", *files] if (folder / "classes.json").exists() else files)

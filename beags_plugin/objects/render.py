@@ -1,0 +1,156 @@
+"""Pictures of the objects of a run: turntables, sheets, and before beside after."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import get_args
+
+import torch
+
+from beags_plugin.core.select import select_class
+from beags_plugin.objects.camera_path import read_camera_path
+from beags_plugin.objects.export import Progress
+from beags_plugin.objects.extract import folder_names, objects_with_gaussians
+from beags_plugin.pictures.cells import write_picture
+from beags_plugin.pictures.objects import Subject, comparison, film, sheet
+from beags_plugin.pictures.options import PictureFormat, RenderOptions
+from beags_plugin.pictures.orbit import orbit, orbit_frame, orbit_settings
+from beags_plugin.pictures.video import FILMS, check_film, encoder, write_film
+from beags_plugin.runs.layout import BASE_SNAPSHOT
+from beags_plugin.runs.read import SavedScene
+from beags_plugin.runs.run import Run
+from beags_plugin.surfaces.frames import bounding_box
+from beags_plugin.system.errors import UserError, check_choice
+
+_PICTURES = (".png", ".jpg", ".jpeg")
+
+
+def render_run(
+    config_path: Path,
+    objects: Sequence[str] = (),
+    form: str = "video",
+    output: Path | None = None,
+    options: RenderOptions | None = None,
+    progress: Progress | None = None,
+    data: Path | None = None,
+) -> Path:
+    """Render objects of a run alone, from cameras around each, into one file; return its path.
+
+    config_path: config.yml of a refined (or assigned) run. objects: names; all but the background if empty. form:
+    "video" (.mp4, .gif), "sheet" (.png, .jpg), or "before-after": assignment alone beside the refined object from the
+    same cameras, either. output: the file; in ``renders/`` of the run if None. progress: receives (done, total)
+    pictures. data: if not where they were. Raises ``UserError`` for a mistake, before anything is rendered.
+    """
+    options = options or RenderOptions()
+    options.check()
+    check_choice(form, get_args(PictureFormat), "format")
+    if options.camera_path is not None:
+        return _along(options.camera_path, config_path, objects, form, output, options, progress)
+    run = Run(config_path, data)
+    scene = run.assigned
+    present = objects_with_gaussians(scene, objects, config_path.parent)
+    names = list(dict.fromkeys(objects)) or [name for name, class_id in present.items() if class_id != 0]
+    if not names:
+        raise UserError(f"{config_path} holds no object but the background: name it with --object background.")
+    if output is None:
+        title = folder_names(scene.classes)[present[names[0]]] if len(names) == 1 else "objects"
+        suffix = ".png" if form != "video" else _film_suffix()
+        output = config_path.parent / "renders" / f"{title}_{form}{suffix}"
+    moving = _check_output(output, form)
+    stages = {"": scene} if form != "before-after" else {"before": _base_of(config_path), "after": scene}
+    subjects = _subjects(run, stages, names, present, form, moving, options)
+    if moving:
+        write_film(output, film(subjects, run.rasterizer, options.background, progress), options.fps)
+    else:
+        draw = comparison if form == "before-after" else sheet
+        write_picture(output, draw(subjects, run.rasterizer, options.background, progress))
+    return output
+
+
+def _film_suffix() -> str:
+    return ".gif" if encoder() is None else ".mp4"
+
+
+def _along(
+    path: Path,
+    config_path: Path,
+    objects: Sequence[str],
+    form: str,
+    output: Path | None,
+    options: RenderOptions,
+    progress: Progress | None,
+) -> Path:
+    """Film the objects together, or the whole scene, along a camera path; arguments as of ``render_run``."""
+    if form == "sheet":
+        raise UserError("a camera path gives a video: leave --format sheet or --camera-path out.")
+    changed = {each.name for each in fields(options) if getattr(options, each.name) != each.default}
+    if ignored := sorted(changed - {"background", "camera_path"}):
+        raise UserError(f"a camera path has a size, cameras and speed of its own: leave --{ignored[0]} out.")
+    cameras, fps = read_camera_path(path)
+    output = output or config_path.parent / "renders" / f"{path.stem}_{form}{_film_suffix()}"
+    check_film(output)
+    run = Run(config_path)
+    scene = run.assigned if objects or form != "video" else run.scene
+    stages = {"": scene} if form == "video" else {"before": _base_of(config_path), "after": scene}
+    present = objects_with_gaussians(scene, objects, config_path.parent) if objects else {}
+    shown = {}
+    for caption, each in stages.items():
+        surfels, members = each.surfels(), each.members
+        chosen = [members.of(present[name]) for name in objects]
+        shown[caption] = surfels[torch.stack(chosen).any(dim=0)] if chosen else surfels
+    subject = Subject("", shown, cameras, run.settings)
+    write_film(output, film([subject], run.rasterizer, options.background, progress), fps)
+    return output
+
+
+def _check_output(path: Path, form: str) -> bool:
+    """Return True if the file is a film; raises ``UserError`` for a name that does not fit the format."""
+    suffix = path.suffix.lower()
+    if form == "video" or (form == "before-after" and suffix in FILMS):
+        check_film(path)
+        return True
+    if suffix not in _PICTURES:
+        films = " (or .mp4, .gif)" if form == "before-after" else ""
+        raise UserError(f"the picture {path} is no .png or .jpg{films}: give it such a name.")
+    return False
+
+
+def _base_of(config_path: Path) -> SavedScene:
+    """Return the state with assignment alone, which a refined run has kept."""
+    snapshot = config_path.parent / BASE_SNAPSHOT / "config.yml"
+    if not snapshot.exists():
+        raise UserError(
+            f"{config_path.parent} has kept no state before refinement ({BASE_SNAPSHOT}/): name the run that was "
+            "refined, or another --format."
+        )
+    return Run(snapshot).assigned
+
+
+def _subjects(
+    run: Run,
+    stages: dict[str, SavedScene],
+    names: Sequence[str],
+    present: dict[str, int],
+    form: str,
+    moving: bool,
+    options: RenderOptions,
+) -> list[Subject]:
+    try:
+        photos = run.viewpoints.cameras
+    except UserError:  # the data are gone: nerfstudio's frame has z up
+        photos = []
+    count = options.frames if moving else options.views
+    if form == "before-after" and not moving:
+        count = max(1, count // 2)
+    size = options.size or (480 if moving else 400 if form == "before-after" else 232)
+    subjects = []
+    for name in names:
+        shown = {
+            caption: select_class(scene.surfels(), scene.members, present[name])[0] for caption, scene in stages.items()
+        }
+        stand = orbit_frame(*bounding_box(list(shown.values())[-1]), photos)
+        cameras = orbit(stand, count, size, options.elevation, options.turn)
+        subjects.append(Subject(name, shown, cameras, orbit_settings(stand)))
+    return subjects

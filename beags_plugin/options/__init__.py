@@ -1,0 +1,1 @@
+"""Options of the scene and of its training: data, without behaviour."""

@@ -1,1 +1,0 @@
-"""Work with finished runs: extract, export, evaluate, render, masks."""

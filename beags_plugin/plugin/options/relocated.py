@@ -1,0 +1,64 @@
+"""The place of a run that an ns-* command opens, by its command line."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Protocol
+
+from beags_plugin.runs.layout import newest_checkpoint
+from beags_plugin.runs.relocation import Placed, check_data, relocate
+from beags_plugin.system.errors import print_user_errors_plainly
+
+_named: list[Path] = []  # config.yml files that Python code has said it reads
+
+
+class OpenedConfig(Placed, Protocol):
+    """A config as nerfstudio's programs read it."""
+
+    overwrite: bool
+
+    def get_checkpoint_dir(self) -> Path:
+        """Return the folder of the run's checkpoints."""
+        ...
+
+
+@contextmanager
+def named(config_path: Path) -> Iterator[None]:
+    """Say which config.yml nerfstudio's functions, such as ``eval_setup``, read in this block.
+
+    Its programs hand PyYAML a text, so that a run which was moved is found by the --load-config of the command line;
+    Python code that calls them has none.
+    """
+    _named.append(config_path)
+    try:
+        yield
+    finally:
+        _named.pop()
+
+
+def place_for_nerfstudio(config: OpenedConfig) -> None:
+    """Place a config that an ns-* command reads from YAML where its --load-config says that the run lies."""
+    path = _named[-1] if _named else _option("--load-config")
+    if path is None:
+        return
+    if Path(sys.argv[0]).stem == "ns-train" and not _named:
+        relocate(config, path, _option("--data"))
+        config.overwrite = "--overwrite" in sys.argv and _option("--overwrite") != Path("False")
+        return
+    print_user_errors_plainly()
+    relocate(config, path, None)
+    newest_checkpoint(config.get_checkpoint_dir())
+    check_data(config.data_path, path)
+
+
+def _option(name: str) -> Path | None:
+    """Return the path that this program's command line gives an option, spelt with - or _; None where it does not."""
+    words = sys.argv[1:]
+    for index, word in enumerate(words):
+        option, equals, value = word.partition("=")
+        if option.replace("_", "-") == name and (equals or index + 1 < len(words)):
+            return Path(value if equals else words[index + 1])
+    return None

@@ -1,0 +1,26 @@
+"""The config of a run that lies on disk, for nerfstudio: to train on, or to look at in its viewer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import yaml
+
+from beags_plugin.plugin.options.config import BeagsTrainerConfig
+from beags_plugin.runs.relocation import relocate
+from beags_plugin.runs.run_config import RunConfigLoader, loaded
+
+
+def load_run_config(path: Path) -> BeagsTrainerConfig:
+    """Read the config of a run, for nerfstudio, without executing code.
+
+    Raises ``UserError`` for any other file, or an older run's.
+    """
+    return loaded(path, lambda text: yaml.load(text, Loader=RunConfigLoader), BeagsTrainerConfig)  # noqa: S506  (it refuses)
+
+
+def open_for_training(config_path: Path, data: Path | None = None) -> BeagsTrainerConfig:
+    """Do as ``runs.relocation.open_run``, for nerfstudio."""
+    config = load_run_config(config_path)
+    relocate(config, config_path, data)
+    return config

@@ -1,1 +1,0 @@
-"""A run on disk: its files, how they are written and read."""

@@ -1,0 +1,108 @@
+"""Reading parts of runs: the trained scene, and the frame it was trained in."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from beags_plugin.core.exposure import Exposures
+from beags_plugin.core.membership import Membership
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.rasterizers.interface import RasterSettings
+from beags_plugin.runs.checkpoint_file import exposures_of, model_state, read_checkpoint
+from beags_plugin.runs.layout import TRANSFORM_FILE, newest_checkpoint
+from beags_plugin.runs.picked import with_picked
+from beags_plugin.runs.relocation import open_run
+from beags_plugin.runs.run_config import RunConfig
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.text import load_json, reason
+from beags_plugin.views.data_options import RunViewOptions
+
+
+@dataclass(frozen=True)
+class SavedScene:
+    """A trained run on disk: config, model state (tensors by name), step and class names.
+
+    picked: whether the classes are those picked in the viewer, not those that the run trained.
+    """
+
+    config: RunConfig
+    state: dict[str, Any]
+    step: int
+    classes: dict[int, str]
+    picked: bool = False
+
+    def surfels(self) -> Surfels:
+        """Return the scene's N Gaussians."""
+        state = {name: self.state[f"gauss_params.{name}"] for name in ("means", "quats", "scales", "opacities")}
+        dc, rest = self.state["gauss_params.features_dc"], self.state["gauss_params.features_rest"]
+        return Surfels(state["means"], state["quats"], state["scales"], state["opacities"][:, 0], dc, rest)
+
+    @property
+    def assigned(self) -> bool:
+        """True if the Gaussians have classes."""
+        return bool(self.state["assigned"])
+
+    @property
+    def members(self) -> Membership:
+        """Which Gaussians belong to which class; all to the background before they have classes."""
+        return Membership(self.state["class_ids"], self.state["_extra_state"].get("objects"))
+
+    @property
+    def exposures(self) -> Exposures | None:
+        """Exposures of the training photos; None where they have one."""
+        return exposures_of(self.state["_extra_state"])
+
+
+def read_scene(config: RunConfig, config_path: Path) -> SavedScene:
+    """Read a run's newest checkpoint, with what was picked in the viewer (``runs.picked``).
+
+    Raises ``UserError`` if the run is incomplete or a file is damaged.
+    """
+    path = newest_checkpoint(config.get_checkpoint_dir())
+    checkpoint = read_checkpoint(path)
+    trained = model_state(checkpoint, path)
+    state = with_picked(trained, config_path.parent)
+    return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"], state is not trained)
+
+
+def read_run(config_path: Path, data: Path | None = None) -> SavedScene:
+    """Open a run and read its scene alone; data: its data, if not where they were."""
+    return read_scene(open_run(config_path, data), config_path)
+
+
+def raster_settings(scene: SavedScene) -> RasterSettings:
+    """Return the depth range of a saved scene."""
+    extent, model = float(scene.state["extent"]), scene.config.model_config
+    return RasterSettings(model.near * extent, model.far * extent)
+
+
+def read_transform(run: Path) -> tuple[Tensor, float] | None:
+    """Read the data parser's transform ([3, 4], scale) of a run; None if the run has no file of it.
+
+    Raises ``UserError`` if the file is damaged.
+    """
+    path = run / TRANSFORM_FILE
+    if not path.exists():
+        return None
+    try:
+        content = load_json(path)
+        transform, scale = torch.tensor(content["transform"], dtype=torch.float64), float(content["scale"])
+        if transform.shape != (3, 4):
+            raise ValueError(f"its transform is {list(transform.shape)}, not [3, 4]")
+        if not (bool(transform.isfinite().all()) and 0 < scale < math.inf):
+            raise ValueError("it holds what is no number, or a scale that is not above 0")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} cannot be read ({reason(error)}): restore it.") from error
+    return transform, scale
+
+
+def view_options(config: RunConfig) -> RunViewOptions:
+    """Return the options of a run's data, with the folder that counts."""
+    parser = replace(config.data_config.dataparser, data=config.data_path)
+    return replace(config.data_config, dataparser=parser, data=parser.data)

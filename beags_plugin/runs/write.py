@@ -1,0 +1,58 @@
+"""Writing runs: checkpoints, and run folders on which every ns-* command works."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from beags_plugin.options.run_format import CONFIG_FILE
+from beags_plugin.runs.layout import TRANSFORM_FILE
+from beags_plugin.system.whole_files import write_text_atomically, write_whole
+
+
+class Copied(Protocol):
+    """A config of which those of other runs are made: ``RunConfig``, or nerfstudio's."""
+
+    relative_model_dir: Path
+
+    def get_base_dir(self) -> Path:
+        """Return the folder of the run."""
+        ...
+
+    def text_in(self, folder: Path) -> str:
+        """Return the config.yml of a run in ``folder`` that is made of this one."""
+        ...
+
+
+def save_atomically(content: Any, path: Path) -> None:
+    """Save by ``torch.save``; the path holds either the old file or the whole new one."""
+    # beside the folder, not in it: nerfstudio takes any file among the checkpoints for one
+    write_whole(path, lambda file: torch.save(content, file), path.parent.parent)
+
+
+def write_run(config: Copied, folder: Path, model_state: dict[str, Tensor], step: int) -> Path:
+    """Write a run that holds ``model_state`` of a ``BeagsModel``; returns the path of its config.yml.
+
+    config: of the run it comes from. step: of the checkpoint.
+    """
+    folder = folder.absolute()
+    state = {
+        f"_model.{name}": value.detach().cpu() if isinstance(value, Tensor) else value
+        for name, value in model_state.items()
+    }
+    checkpoint = {"step": step, "pipeline": state, "optimizers": {}, "schedulers": {}, "scalers": {}}
+    path = folder / config.relative_model_dir / f"step-{step:09d}.ckpt"
+    save_atomically(checkpoint, path)
+    for old in path.parent.glob("*.ckpt"):  # of an earlier run into the same folder
+        if old != path:
+            old.unlink()
+    config_path = folder / CONFIG_FILE
+    write_text_atomically(config.text_in(folder), config_path)
+    transform = config.get_base_dir() / TRANSFORM_FILE
+    if transform.exists() and transform.parent != folder:
+        shutil.copyfile(transform, folder / TRANSFORM_FILE)
+    return config_path

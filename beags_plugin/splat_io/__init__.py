@@ -1,0 +1,1 @@
+"""Files of splats, read and written, and their frames."""

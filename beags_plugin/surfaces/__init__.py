@@ -1,0 +1,1 @@
+"""Surfaces of objects: fused, closed, placed by the photos, textured."""

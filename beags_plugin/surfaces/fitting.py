@@ -1,0 +1,120 @@
+"""A texture fitted to photos: what a reader of the mesh draws shall be each photo's pixels, in the least squares.
+
+The mean of photos is blurred: each of its texels lies between the pixels of each photo, and a reader interpolates
+between texels once more. Pixels are linear in texels, so the texels that give the photos back are a sparse least
+squares problem, with the mean as what it starts from and is held to (in the manner of Goldluecke and Cremers,
+"Superresolution texture maps for multiview reconstruction", 2009).
+
+Determinism: the solver runs on one thread of BLAS, whose sums depend on how many it has.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from beags_plugin.core.lifting import TAU
+from beags_plugin.surfaces.atlas import Atlas
+from beags_plugin.surfaces.baking import FLATTEST, well_inside
+from beags_plugin.surfaces.color import linear_from_srgb, srgb_from_linear
+from beags_plugin.surfaces.fusion import Mesh
+from beags_plugin.surfaces.item import Photo
+from beags_plugin.surfaces.surface import rays_through, surface_of
+
+_RAYS = 0.25 * np.array([[1.0, 1.0], [3.0, 1.0], [1.0, 3.0], [3.0, 3.0]])  # in a pixel
+_MOST = 1_000_000  # pixels of all photos that are looked at; each takes about 400 bytes
+_HOLD = 0.2  # pull to the mean, in photos' pixels (chosen on tabletop 0 and room 0: notes/export.md)
+_STEPS = 20  # of the solver: it sharpens the longer the more, noise too
+
+
+def fitted(
+    image: np.ndarray,
+    atlas: Atlas,
+    mesh: Mesh,
+    photos: Sequence[Photo],
+    exposures: np.ndarray,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> np.ndarray:
+    """Return a mesh's picture [S, S, 3] uint8 sRGB, fitted to photos from one that is their mean.
+
+    exposures: [V, 3] of the photos, which are divided by them. Texels that no photo shows stay as they are. progress:
+    receives (done, total) photos.
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.linalg import lsmr
+    from threadpoolctl import threadpool_limits
+
+    if not photos:
+        return image
+    caster, columns, shares, colors = surface_of(mesh), [], [], []
+    inside = [int(well_inside(photo.own()).sum()) for photo in photos]
+    part = min(1.0, _MOST / max(sum(inside), 1))
+    for done, (photo, exposure) in enumerate(zip(photos, exposures, strict=True), start=1):
+        found = _pixels(photo, atlas, mesh, caster, math.ceil(part * inside[done - 1]))
+        columns.append(found[0])
+        shares.append(found[1])
+        colors.append(srgb_from_linear(linear_from_srgb(found[2]) / exposure))
+        progress(done, len(photos))
+    column, target = np.concatenate(columns), np.concatenate(colors)
+    if not len(column):
+        return image
+    shown = np.zeros(atlas.size**2, bool)
+    shown[column] = True
+    used = np.flatnonzero(shown)
+    rank = np.cumsum(shown, dtype=np.int32) - 1
+    starts = np.arange(0, column.size + 1, column.shape[1])
+    matrix: Any = csr_array(
+        (np.concatenate(shares).reshape(-1), rank[column].reshape(-1), starts), shape=(len(column), len(used))
+    )
+    matrix.sum_duplicates()
+    texels = image.reshape(-1, 3)[used] / 255.0
+    with threadpool_limits(1, "blas"):
+        for channel in range(3):
+            missing = target[:, channel] - matrix @ texels[:, channel]
+            texels[:, channel] += lsmr(matrix, missing, damp=math.sqrt(_HOLD), atol=0, btol=0, maxiter=_STEPS)[0]
+    new = image.reshape(-1, 3).copy()
+    new[used] = np.round(255.0 * np.clip(texels, 0.0, 1.0))
+    return new.reshape(image.shape)
+
+
+def _pixels(
+    photo: Photo, atlas: Atlas, mesh: Mesh, caster: Any, most: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which texels the pixels of a photo show, [M, 16] int32, their shares [M, 16] and the pixels [M, 3].
+
+    Pixels well inside the item's mask, before which nothing of the scene stands, and that see the outside of the mesh,
+    not too flat, with all their rays; at most ``most`` of them, chosen at random. Texels count row by row.
+    """
+    rows, cols = np.nonzero(well_inside(photo.own()))
+    if len(rows) > most:
+        chosen = np.sort(np.random.default_rng(0).choice(len(rows), most, replace=False))
+        rows, cols = rows[chosen], cols[chosen]
+    xy = (np.stack([cols, rows], axis=1)[:, None] + _RAYS).reshape(-1, 2)
+    rays, ways = rays_through(mesh, photo.camera, xy)
+    hit = caster.cast_rays(rays)
+    depth, normals = hit["t_hit"].numpy(), hit["primitive_normals"].numpy()
+    cosine = -np.einsum("pd,pd->p", normals, ways) / np.linalg.norm(ways, axis=1)
+    scene = np.repeat(photo.depth().numpy()[rows, cols], len(_RAYS))
+    good = np.isfinite(depth) & (cosine > FLATTEST) & ~((scene > 0) & (scene < (1.0 - TAU) * depth))
+    whole = good.reshape(-1, len(_RAYS)).all(axis=1)
+    rays_of = np.repeat(whole, len(_RAYS))
+    face = hit["primitive_ids"].numpy()[rays_of].astype(np.int64)
+    u, v = hit["primitive_uvs"].numpy()[rays_of].astype(np.float64).T
+    uv = np.einsum("pc,pcd->pd", np.stack([1.0 - u - v, u, v], axis=1), atlas.uv[atlas.faces[face]])
+    columns, shares = _between(uv, atlas.size)
+    pixels = photo.image().double().numpy()[rows[whole], cols[whole]]
+    shape = (len(pixels), 4 * len(_RAYS))
+    return columns.reshape(shape), (shares / len(_RAYS)).astype(np.float32).reshape(shape), pixels
+
+
+def _between(uv: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the four texels [P, 4] int32 nearest to places in a picture and their shares [P, 4]."""
+    at = np.clip(uv * size - 0.5, 0.0, size - 1.0)
+    first = np.minimum(np.floor(at).astype(np.int32), size - 2)
+    x, y = (at - first).T
+    column, row = first.T
+    columns = np.stack([row * size + column + step for step in (0, 1, size, size + 1)], axis=1)
+    return columns, np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=1)

@@ -1,0 +1,93 @@
+"""Meshes of items: the surface that the views see, placed by the photos, closed where asked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from beags_plugin.surfaces.closing import Closed, closed
+from beags_plugin.surfaces.fusion import Mesh, fuse, suitable_resolution, without_small_parts
+from beags_plugin.surfaces.item import ExportItem, NothingToExport
+from beags_plugin.surfaces.mesh_options import MeshOptions
+from beags_plugin.surfaces.surface import area_vectors
+from beags_plugin.surfaces.surface_alignment import Placed, placed
+from beags_plugin.system.open3d_kernels import open3d_kernels
+from beags_plugin.system.progress import progress_bar
+
+
+def seen_surface(item: ExportItem, options: MeshOptions) -> Mesh:
+    """Return the surface that the training views see of an item rendered alone, maybe of no face; made once."""
+    if item.views is None:
+        raise ValueError("a surface needs the views of the training photos")
+    resolution = options.resolution or suitable_resolution(item.surfels, item.views.cameras)
+    chosen = resolution, options.truncation, options.memory_mb, options.min_views
+    fused = item.shared.get(("fused", chosen))
+    if fused is None:
+        fused = item.shared["fused", chosen] = fuse(item.surfels, item.views, *chosen, item.on_render)
+    return without_small_parts(fused, options.smallest_part)
+
+
+def placed_surface(item: ExportItem, options: MeshOptions) -> Placed:
+    """Return the seen surface where the photos place it, if there are any; raises ``NothingToExport`` without a face.
+
+    It is made once for each set of options.
+    """
+    mesh = seen_surface(item, options)
+    if not len(mesh.faces):
+        raise NothingToExport(
+            f"no surface of {item.name!r} is seen in {options.min_views} training views: "
+            "lower --min-views, or export it as splats."
+        )
+    if not item.photos:
+        return Placed(mesh, 0.0)
+    chosen = options.resolution, options.truncation, options.memory_mb, options.min_views, options.smallest_part
+    found = item.shared.get(("placed", chosen))
+    if found is None:
+        with progress_bar("Placing the surface", passing=True) as progress:
+            found = item.shared["placed", chosen] = placed(mesh, item.photos, progress)
+    return found
+
+
+def closed_surface(item: ExportItem, mesh: Mesh) -> Closed:
+    """Return a surface of an item closed; raises ``NothingToExport`` if it encloses nothing."""
+    solid = closed(mesh)
+    if solid is None:
+        raise NothingToExport(
+            f"the surface of {item.name!r} encloses nothing, so it cannot be closed: export it without --close, as "
+            "splats or .glb."
+        )
+    return solid
+
+
+@dataclass(frozen=True)
+class MadeMesh:
+    """A mesh; pixels: that photos moved its places outwards, in the mean, 0 without photos.
+
+    invented: [V] bool, vertices where no view showed a surface, None of a mesh that was not closed.
+    """
+
+    mesh: Mesh
+    pixels: float
+    invented: np.ndarray | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """Return the manifest's entries about it; closed_share: of its area, where all corners are invented."""
+        found = {"vertices": len(self.mesh.vertices), "triangles": len(self.mesh.faces), "voxel": self.mesh.voxel}
+        if self.pixels:
+            found["moved_pixels"] = round(self.pixels, 3)
+        if self.invented is None:
+            return found
+        areas = np.linalg.norm(area_vectors(self.mesh), axis=1)
+        share = areas[self.invented[self.mesh.faces].all(axis=1)].sum() / max(areas.sum(), 1e-300)
+        return found | {"closed_share": round(float(share), 4)}
+
+
+def open3d_missing() -> str | None:
+    """Return None if Open3D can be loaded, else one sentence: why not and what to install."""
+    try:
+        open3d_kernels()
+    except (ImportError, OSError) as error:  # a system library that it needs may be missing
+        return f"Open3D cannot be loaded ({error}); pip install open3d, which needs libX11 and libGL."
+    return None

@@ -1,0 +1,1 @@
+"""Photos, poses and masks of a scene as views; without nerfstudio."""

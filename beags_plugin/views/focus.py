@@ -1,0 +1,171 @@
+"""Focus: whether training sees close-ups of objects, and where these are in its photos."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import say
+from beags_plugin.views.close_ups import CloseUps, kept_pixels, kept_size, read_close_ups
+from beags_plugin.views.photo_files import Box, PhotoFiles
+
+SHARE = 0.5
+"""Share of the steps that see a close-up where nobody gives one."""
+MOST_COVERED = 0.4
+"""Share of the photos' pixels from which on objects are large enough without close-ups."""
+PIXELS = 0.8
+"""Of a step with a close-up, in units of those of a whole photo: it shows more Gaussians a pixel, which take time."""
+LEAST_GAIN = 1.2
+"""Factor by which close-ups show objects larger than whole photos do, below which they are not worth their steps."""
+MARGIN = 0.1  # space on each side of an object, over its longer side
+LEAST_PART = 0.05  # of an object's pixels; smaller parts of its mask are taken for errors
+CLOSE = 1.25  # Boxes become one where that has at most this many times their pixels.
+LEAST_SIDE = 32  # pixels of a close-up's side; SSIM's window has 11
+
+
+@dataclass(frozen=True)
+class Aim:
+    """Where the objects of a photo are. boxes: of its close-ups. covered: share of its pixels that show objects.
+
+    gain: factor by which close-ups show objects larger than the whole photo at the size that is trained on. side: of
+    the square as large as the objects' boxes, pixels, in the whole photo.
+    """
+
+    boxes: list[Box]
+    covered: float
+    gain: float = 1.0
+    side: float = 0.0
+
+
+def share_of(focus: str) -> float | None:
+    """Return the share of the steps that an option asks for; None for auto.
+
+    Raises ``UserError`` for what is neither auto, nor off, nor a share.
+    """
+    if focus in ("auto", "off"):
+        return None if focus == "auto" else 0.0
+    with suppress(ValueError):
+        if 0.0 <= float(focus) <= 1.0:
+            return float(focus)
+    raise UserError(f"datamanager.focus is {focus}: give auto, off, or the share of the steps with objects, 0 to 1.")
+
+
+def focused(
+    focus: str, files: PhotoFiles, labels: Callable[[int], Tensor | None], names: Sequence[str], seed: int
+) -> CloseUps | None:
+    """Return the close-ups that training is to see; None where it sees whole photos alone.
+
+    labels: returns those of a photo [H, W] int32 at the size that is trained on, or None. names: of the photos. It says
+    in a line what the objects get, or with a share given why there are no close-ups.
+    """
+    share = share_of(focus)
+    if share == 0.0:
+        return None
+    cameras = files.cameras
+    pixels = max(round(PIXELS * float((cameras.width * cameras.height).double().mean())), 1)
+    kept = kept_pixels(pixels, len(cameras))
+    aims = {
+        photo: _aim(files, photo, found.cpu().numpy(), kept)
+        for photo in range(len(cameras))
+        if (found := labels(photo)) is not None
+    }
+    shown = [aim for aim in aims.values() if aim.boxes]
+    covered = float(np.mean([aim.covered for aim in aims.values()])) if aims else 0.0
+    if not shown:
+        if share is not None:
+            say("No mask of a training photo shows an object: focus is off.")
+        return None
+    gain = float(np.mean([aim.gain for aim in shown]))
+    if share is None and (covered >= MOST_COVERED or gain < LEAST_GAIN):
+        if covered >= MOST_COVERED and gain >= LEAST_GAIN:
+            say(f"Objects cover {covered:.0%} of the photos' pixels: training sees whole photos alone (focus is off).")
+        return None
+    share = SHARE if share is None else share
+    side = float(np.mean([aim.side for aim in shown]))
+    say(
+        f"Objects cover {covered:.1%} of the photos' pixels: {share:.0%} of the steps see close-ups of them, in which "
+        f"they are about {side * gain:.0f} pixels large, not {side:.0f}."
+    )
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        aimed = [photo for photo, aim in aims.items() if aim.boxes]
+        read = pool.map(lambda photo: read_close_ups(files, photo, aims[photo].boxes, kept), aimed)
+        close_ups = [close_up for of_photo in read for close_up in of_photo]
+    return CloseUps(close_ups, names, pixels, share, seed)
+
+
+def aim_by(close_ups: CloseUps, files: PhotoFiles, labels: Sequence[Tensor]) -> None:
+    """Add close-ups of photos that have none, where their labels [H, W] int show objects, as after reprojection."""
+    for photo in close_ups.blind():
+        whole = labels[photo].cpu().numpy().astype(np.int32)
+        if boxes := _aim(files, photo, whole, close_ups.kept).boxes:
+            close_ups.add(read_close_ups(files, photo, boxes, close_ups.kept, whole))
+
+
+def _aim(files: PhotoFiles, photo: int, labels: np.ndarray, kept: float) -> Aim:
+    covered = float(((labels != BACKGROUND) & (labels != IGNORE)).mean())
+    parts = list(_boxes(labels))
+    if not parts:
+        return Aim([], covered)
+    camera = files.full_camera(photo)
+    scale = np.array([camera.width / labels.shape[1], camera.height / labels.shape[0]] * 2)
+    full = partial(_full_box, scale=scale, width=camera.width, height=camera.height)
+    boxes = [full(box) for box in _joined([_with_margin(box) for box in parts])]
+    shares = [np.prod(kept_size(box, len(boxes), kept)) / _area(box) for box in boxes]
+    gain = float(np.sqrt(np.average(shares, weights=[_area(box) for box in boxes]) * scale[0] * scale[1]))
+    side = float(np.sqrt(np.mean([_area(box) for box in parts])))
+    return Aim(boxes, covered, gain, side)
+
+
+def _boxes(labels: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the box of each object of labels [H, W], but for small parts of its mask that lie apart."""
+    for class_id in np.unique(labels):
+        if class_id in (BACKGROUND, IGNORE):
+            continue
+        _, _, stats, _ = cv2.connectedComponentsWithStats((labels == class_id).astype(np.uint8), connectivity=8)
+        parts = stats[1:]
+        parts = parts[parts[:, cv2.CC_STAT_AREA] >= LEAST_PART * parts[:, cv2.CC_STAT_AREA].sum()]
+        left_top = parts[:, [cv2.CC_STAT_LEFT, cv2.CC_STAT_TOP]]
+        right_bottom = left_top + parts[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]
+        yield np.concatenate([left_top.min(axis=0), right_bottom.max(axis=0)]).astype(np.float64)
+
+
+def _with_margin(box: np.ndarray) -> np.ndarray:
+    margin = MARGIN * max(box[2] - box[0], box[3] - box[1])
+    return box + margin * np.array([-1.0, -1.0, 1.0, 1.0])
+
+
+def _area(box: Sequence[float] | np.ndarray) -> float:
+    return float((box[2] - box[0]) * (box[3] - box[1]))
+
+
+def _joined(boxes: list[np.ndarray]) -> list[np.ndarray]:
+    """Return the boxes with those that stand close to each other joined into one."""
+    for one, other in combinations(range(len(boxes)), 2):
+        whole = np.concatenate([np.minimum(boxes[one], boxes[other])[:2], np.maximum(boxes[one], boxes[other])[2:]])
+        if _area(whole) <= CLOSE * (_area(boxes[one]) + _area(boxes[other])):
+            rest = [box for index, box in enumerate(boxes) if index not in (one, other)]
+            return _joined([*rest, whole])
+    return boxes
+
+
+def _full_box(box: np.ndarray, scale: np.ndarray, width: int, height: int) -> Box:
+    """Return a box in pixels of the file, within it and no smaller than ``LEAST_SIDE`` where the file is not."""
+    sides = []
+    for low, high, size in zip((box * scale)[:2], (box * scale)[2:], (width, height), strict=True):
+        first, last = max(round(low), 0), min(round(high), size)
+        if last - first < (least := min(LEAST_SIDE, size)):
+            first = min(max((first + last - least) // 2, 0), size - least)
+            last = first + least
+        sides.append((first, last))
+    (left, right), (top, bottom) = sides
+    return left, top, right, bottom

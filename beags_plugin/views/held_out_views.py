@@ -1,0 +1,165 @@
+"""The held-out views of a run's data, as evaluation takes them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal, overload
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera, cropped
+from beags_plugin.data.files import image_size, same_proportions
+from beags_plugin.data.ground_truth import GroundTruth
+from beags_plugin.evaluation.records import EvalView, FullPhoto
+from beags_plugin.labels.class_ids import IGNORE, resize_nearest
+from beags_plugin.labels.classes import read_mask, read_object_mask
+from beags_plugin.system.errors import UserError
+from beags_plugin.views.cameras import camera_from_nerfstudio
+from beags_plugin.views.photo_files import Box
+from beags_plugin.views.run_data import BothSplits
+
+_NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={}, removed={}, removed_shown={})
+
+
+class HeldOutViews(Sequence[EvalView]):
+    """The test views of the data; masks are read when a view is asked for, at the size of their files.
+
+    Masks of all visible objects come from ``ground_truth/masks``, else from the data's own, unless a program made these
+    of all views (``labels.classes.NO_TRUTH``); those of single objects
+    from ``ground_truth/visible``, silhouettes from ``ground_truth/silhouettes``, and what training photos show of them
+    from ``ground_truth/seen``, or from where the layout has them; pictures without an object from
+    ``ground_truth/removed``, and where these can be known from ``ground_truth/removed_shown``. All are undistorted like
+    the photographs. Indexing raises ``UserError`` for a file that cannot be read or has other proportions than its
+    photograph.
+    """
+
+    def __init__(self, manager: BothSplits, classes: Mapping[int, str], background: Tensor) -> None:
+        """Open the views. classes: id to name. background: [3], behind photographs with alpha, as in training."""
+        self.manager = manager
+        self.classes = classes
+        self.background = background.cpu()
+        self._views = self.manager.views("test")
+        self._metadata = self.manager.eval_dataset.metadata
+        self._kind: str = self._metadata["mask_kind"]
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    @overload
+    def __getitem__(self, index: int) -> EvalView: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[EvalView]: ...
+    def __getitem__(self, index: int | slice) -> EvalView | list[EvalView]:
+        chosen = range(len(self))[index]
+        return self._view(chosen) if isinstance(chosen, int) else [self._view(i) for i in chosen]
+
+    @property
+    def no_truth(self) -> Path | None:
+        """Return the file that says that a program drew the data's own masks; None where they count as truth."""
+        return self._metadata["no_truth"]
+
+    @property
+    def stray_truth(self) -> str | None:
+        """Return a sentence about exact masks that belong to no view of the data; None without any."""
+        return self._metadata["stray_truth"]
+
+    def trained_on(self) -> int:
+        """Return the number of these views that are training views too."""
+        trained = set(self.manager.train_dataset.image_filenames)
+        return sum(path in trained for path in self.manager.eval_dataset.image_filenames)
+
+    def cameras(self, split: Literal["train", "eval"]) -> list[Camera]:
+        """Return the cameras of the training or the held-out views, without lens distortion; no photo is read."""
+        cameras = (self.manager.train_dataset if split == "train" else self.manager.eval_dataset).cameras
+        return [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
+
+    def _view(self, index: int) -> EvalView:
+        view = self._views[index]
+        truth = self._metadata["ground_truth"] or _NO_TRUTH
+        exact = truth["masks"][index] if truth["masks"] else None
+        # Where objects were labelled one by one, a view without such masks has no truth: its own mask is no substitute.
+        given = self.no_truth is None and not truth["visible"]
+        own = self._metadata["mask_filenames"][index] if given else None
+        file, kind = (exact, "ids") if exact else (own, self._kind)
+        visible = None
+        if file is not None:
+            ids = read_mask(file, kind, self._metadata["ignore_ids"])
+            visible = torch.from_numpy(self._straight(file, ids, index).astype(np.int32))
+        silhouettes, unknown_silhouettes = self._per_object(truth["silhouettes"], index)
+        visible_objects, unknown_visible = self._per_object(truth["visible"], index)
+        seen, _ = self._per_object(truth["seen"], index)
+        seen = {c: _of_size(mask, silhouettes[c]) for c, mask in seen.items() if c in silhouettes}
+        return EvalView(
+            view.camera,
+            view.image_on(self.background),
+            visible,
+            silhouettes or None,
+            view.name,
+            seen or None,
+            visible_objects or None,
+            {c: self._picture(file, index) for c, file in self._files(truth["removed"], index).items()} or None,
+            self._per_object(truth["removed_shown"], index)[0] or None,
+            unknown_silhouettes or None,
+            unknown_visible or None,
+            self._full(index, view.camera),
+        )
+
+    def _full(self, index: int, camera: Camera) -> FullPhoto | None:
+        """Return the photograph of a view at the size of its file; None where it is trained on at that size."""
+        files = self.manager.files["eval"]
+        full = files.full_camera(index)
+        if (full.width, full.height) == (camera.width, camera.height):
+            return None
+
+        def region(box: Box) -> tuple[Camera, Tensor]:
+            left, top, right, bottom = box
+            found = files.full_regions(index, [box])[0]
+            photo = found["image"].float() / 255.0
+            if "alpha" in found:
+                photo = photo + (1.0 - found["alpha"].float() / 255.0)[..., None] * self.background
+            return cropped(full, left, top, right - left, bottom - top), photo
+
+        return FullPhoto(full, region)
+
+    def _per_object(
+        self, files: Mapping[str, Sequence[Path | None]], view: int
+    ) -> tuple[dict[int, Tensor], dict[int, Tensor]]:
+        """Read the [h, w] bool masks of a view by object id, and what of them cannot be told, if anything."""
+        masks, unknown = {}, {}
+        for class_id, file in self._files(files, view).items():
+            ids = self._straight(file, read_object_mask(file, truth=True), view)
+            masks[class_id] = torch.from_numpy(ids == 1)
+            if (untold := ids == IGNORE).any():  # Pixels outside the lens cannot be told either.
+                unknown[class_id] = torch.from_numpy(untold)
+        return masks, unknown
+
+    def _files(self, files: Mapping[str, Sequence[Path | None]], view: int) -> dict[int, Path]:
+        """Return object id to its file of a view, for those that have one."""
+        found = {c: files[name][view] for c, name in self.classes.items() if name in files}
+        return {c: file for c, file in found.items() if file is not None}
+
+    def _picture(self, file: Path, view: int) -> Tensor:
+        """Read a picture [H, W, 3] without an object, as the photograph is read."""
+        self._check_proportions("picture", file, image_size(file), view)
+        return self.manager.files["eval"].picture(file, view)
+
+    def _straight(self, file: Path, ids: np.ndarray, view: int) -> np.ndarray:
+        """Undistort ids; raises ``UserError`` if they have other proportions than the photograph."""
+        self._check_proportions("mask", file, (ids.shape[1], ids.shape[0]), view)
+        return self.manager.files["eval"].undistorted(ids, view)
+
+    def _check_proportions(self, what: str, file: Path, size: tuple[int, int], view: int) -> None:
+        """Raise ``UserError`` if a file of width and height ``size`` has other proportions than the photograph."""
+        (width, height), (own_width, own_height) = image_size(self.manager.eval_dataset.image_filenames[view]), size
+        if not same_proportions((width, height), size):
+            raise UserError(
+                f"the {what} {file} is {own_width}x{own_height} pixels but its image is {width}x{height}: "
+                f"make it in the proportions of the image."
+            )
+
+
+def _of_size(mask: Tensor, other: Tensor) -> Tensor:
+    return mask if mask.shape == other.shape else torch.from_numpy(resize_nearest(mask.numpy(), *other.shape))

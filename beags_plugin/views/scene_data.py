@@ -1,0 +1,187 @@
+"""The images, poses and masks of a scene in any registered layout."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from beags_plugin.data.dataset import Dataset, MaskKind
+from beags_plugin.data.files import check_mask_files, check_same_size, files_of_views, image_size
+from beags_plugin.data.ground_truth import find_ground_truth, of_views, stray_note
+from beags_plugin.data.labels import read_class_names
+from beags_plugin.data.layout import read_dataset
+from beags_plugin.data.orientation import sideways_photo_error
+from beags_plugin.data.split import split_views
+from beags_plugin.labels.classes import NO_TRUTH
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import say
+from beags_plugin.views.cameras import SceneCameras, check_cameras, downscaled_size, resize_cameras
+from beags_plugin.views.data_options import DataOptions
+from beags_plugin.views.placing import Normalization, Placing
+from beags_plugin.views.poses import PosedViews, read_poses
+from beags_plugin.views.recognised import images_root, recognised
+from beags_plugin.views.seed_points import starting_points
+
+if TYPE_CHECKING:
+    from beags_plugin.views.tracks import Tracks
+
+LEAST_PIXELS = 2  # of a side that was scaled down; fewer show nothing
+
+
+@dataclass(frozen=True)
+class SplitData:
+    """The V views of one split.
+
+    metadata: per view where it is a list: ``points3D_xyz`` [P, 3] float32 in the world of the cameras, ``points3D_rgb``
+    [P, 3] uint8, ``points3D_random`` bool, ``classes`` dict id -> name, ``mask_filenames`` list of Path or None,
+    ``mask_kind`` (see ``data.dataset.MaskKind``), ``no_truth`` (the file that says so of the masks) or None,
+    ``ignore_ids``, ``ground_truth`` (see ``data.ground_truth.GroundTruth``) or None, ``stray_truth`` (a sentence about
+    exact masks of no view) or None.
+    """
+
+    images: list[Path]
+    cameras: SceneCameras
+    metadata: dict[str, Any]
+    placing: Placing
+
+
+class SceneData:
+    """A scene that options name, read when it is first asked for; every user error is a ``UserError``.
+
+    truth: whether to look for exact masks too, which evaluation alone needs.
+    """
+
+    def __init__(self, config: DataOptions, truth: bool = True) -> None:
+        self.config = config
+        self._truth = truth
+        self._views: PosedViews | None = None
+        self._metadata: dict[str, Any] = {}
+
+    def posed_views(self) -> tuple[Dataset, PosedViews]:
+        """Read the scene and all its views; masks are not read."""
+        config = self.config
+        config.check()
+        self._scene = scene = read_dataset(Path(config.data).absolute(), config.layout, config.images_path)
+        options = {name: getattr(config, name) for name in Normalization.__dataclass_fields__}
+        views = read_poses(scene.poses, scene.root, Normalization(**options), config.strict)
+        check_cameras(views.cameras, views.images)
+        return scene, views
+
+    def tracks(self, split: str) -> Tracks:
+        """Return which points each view of a split shows, and where: of the COLMAP model, else seed points.
+
+        Empty where nothing says so. The outputs of a split must have been asked for before.
+        """
+        from beags_plugin.views.tracks import features_of, seeds_seen  # they import OpenCV
+
+        views = self._views
+        assert views is not None
+        found = features_of(self._scene, views)
+        if not found and not self._metadata["points3D_random"]:
+            found = seeds_seen(self._scene.root, self._metadata["points3D_xyz"].double().numpy(), views)
+        return [found[view] for view in self.views_of_split(views, split)] if found else []
+
+    def mask_files(self, scene: Dataset, views: PosedViews) -> tuple[list[Path | None], Path, MaskKind]:
+        """Return the mask file of each view or None, the folder of the masks, and their kind."""
+        folder, kind = scene.root / scene.masks, scene.mask_kind
+        if self.config.masks_path is not None:
+            folder, kind = scene.root / self.config.masks_path, "ids"
+        elif scene.mask_files is not None:
+            return [scene.mask_files.get(image.stem) for image in views.images], folder, kind
+        return files_of_views(folder, views.images, images_root(scene)), folder, kind
+
+    def split(self, split: str) -> SplitData:
+        """Return the views of "train", "val" or "test"; all splits share one reading of the poses."""
+        if self._views is None:
+            self._read()
+        assert (views := self._views) is not None
+        chosen = self.views_of_split(views, split)
+        metadata = dict(self._metadata)
+        metadata["mask_filenames"] = [metadata["mask_filenames"][i] for i in chosen]
+        if metadata["ground_truth"] is not None:
+            metadata["ground_truth"] = of_views(metadata["ground_truth"], chosen)
+        images = [views.images[i] for i in chosen]
+        return SplitData(images, views.cameras.chosen(torch.tensor(chosen)), metadata, views.placing)
+
+    def _read(self) -> None:
+        scene, views = self.posed_views()
+        self._metadata = self._read_metadata(scene, views)
+        for line in recognised(self, scene, views, self._metadata):
+            say(line)
+        self._views = views
+
+    def _read_metadata(self, scene: Dataset, views: PosedViews) -> dict[str, Any]:
+        """Check the files against each other and return the metadata that all splits share."""
+        config = self.config
+        sizes = [image_size(path) for path in views.images]
+        self.fit_cameras(views, sizes)
+        masks, folder, kind = self.mask_files(scene, views)
+        if not any(masks):
+            check_mask_files(folder, views.images)
+        check_same_size(masks, sizes, views.images)
+        present = [mask for mask in masks if mask is not None and kind == "ids"]
+        truth = (scene.root / config.ground_truth_path, views.images, images_root(scene))
+        classes_file = scene.root / config.classes_path
+        self._check_named(folder, classes_file)
+        known = (scene.class_names, scene.class_names_file)
+        return {
+            **starting_points(scene, views, config.num_random_points),
+            "classes": read_class_names(classes_file, present, config.ignore_ids, *known),
+            "mask_filenames": masks,
+            "mask_kind": kind,
+            "no_truth": folder / NO_TRUTH if (folder / NO_TRUTH).exists() else None,
+            "ignore_ids": tuple(config.ignore_ids),
+            "ground_truth": find_ground_truth(scene, *truth) if self._truth else None,
+            "stray_truth": stray_note(*truth) if self._truth else None,
+        }
+
+    def _check_named(self, masks: Path, classes: Path) -> None:
+        """Raise ``UserError`` where the user has named masks or classes that are not there."""
+        if self.config.masks_path is not None and not masks.is_dir():
+            raise UserError(f"the folder of masks {masks} does not exist: correct masks_path.")
+        usual = self.config.classes_path == Path("classes.json")
+        if classes.is_dir() or not (usual or classes.is_file()):
+            raise UserError(f"the class names {classes} are no file: correct classes_path.")
+
+    def fit_cameras(self, views: PosedViews, sizes: Sequence[tuple[int, int]]) -> None:
+        """Resize the cameras in place to the loaded images: the files' sizes divided by the downscale factor."""
+        cameras = views.cameras
+        camera_sizes = torch.cat([cameras.width, cameras.height], 1).tolist()
+        for path, (width, height), (camera_width, camera_height) in zip(views.images, sizes, camera_sizes, strict=True):
+            # A smaller copy of the images rounds each side by up to a pixel; more is another picture.
+            expected = width * camera_height / camera_width
+            if abs(expected - height) > 1.0 + expected / width:
+                if sentence := sideways_photo_error(path, (width, height), (camera_width, camera_height)):
+                    raise UserError(sentence)
+                raise UserError(
+                    f"the image {path} is {width}x{height} pixels but its camera is {camera_width}x{camera_height}: "
+                    f"use the images that the poses were made from."
+                )
+        actual = torch.tensor(sizes).to(torch.int64)
+        factor = self._scene.downscale if self.config.downscale_factor is None else self.config.downscale_factor
+        size = downscaled_size(actual, factor)
+        if int(size.min()) < LEAST_PIXELS <= int(actual.min()):
+            raise UserError(
+                f"downscale_factor is {factor:g}, which leaves {int(size.min())} pixels of "
+                f"a side of {views.images[0]}: give less, so that {LEAST_PIXELS} or more are left."
+            )
+        resize_cameras(cameras, size[:, :1], size[:, 1:])
+
+    def views_of_split(self, views: PosedViews, split: str) -> list[int]:
+        """Return the indices of the views of "train", "val" or "test"."""
+        if split not in ("train", "val", "test"):
+            raise ValueError(f"unknown split {split!r}")
+        if views.members is not None:
+            # nerfstudio asks for val while training and for test in ns-eval; data often names one of them
+            for name in {"train": ("train",), "val": ("val", "test"), "test": ("test", "val")}[split]:
+                if views.members.get(name):
+                    return views.members[name]
+            where = self._scene.root
+            raise UserError(f"the data in {where} names splits but no views for {split}: name some, or delete them.")
+        config = self.config
+        train, held_out = split_views(views.stems, self._scene.split, config.eval_interval, config.held_out)
+        return train if split == "train" else held_out

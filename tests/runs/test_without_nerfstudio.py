@@ -1,0 +1,109 @@
+"""Finished runs are read without nerfstudio and torchvision, and as nerfstudio reads them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+pytest.importorskip("nerfstudio")
+
+from run_folders import write_prepared, write_scene, write_trained
+
+from beags_plugin.plugin.options.saved_config import load_run_config, open_for_training
+from beags_plugin.runs.relocation import open_run
+from beags_plugin.runs.run_config import read_run_config
+from beags_plugin.runs.write import write_run
+from beags_plugin.system.errors import UserError
+
+COMMANDS = [
+    "extract --load-config {run}",
+    "export --load-config {run} --all --format ply obj --resolution 8",
+    "eval --load-config {run}",
+    "render --load-config {run} --object cup --format sheet --size 32 --views 2",
+    "masks reproject --load-config {run}",
+    "masks check --load-config {run} --output {tmp}/checked",
+    "doctor --data {data}",
+]
+CALL = """
+import contextlib, io, json, sys
+from beags_plugin.commands.cli import main
+for words in json.loads(sys.argv[1]):
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        main(words)
+    found = {name.split(".")[0] for name in sys.modules} & {"nerfstudio", "torchvision"}
+    assert not found, f"beags {' '.join(words)} imports {found}"
+print("none")
+"""
+
+
+@pytest.fixture
+def config(tmp_path) -> Path:
+    return write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
+
+
+def test_no_command_on_a_finished_run_imports_nerfstudio(config, tmp_path):
+    write_prepared(config.parent)
+    lines = [each.format(run=config, tmp=tmp_path, data=tmp_path / "lab").split() for each in COMMANDS]
+    done = subprocess.run([sys.executable, "-c", CALL, json.dumps(lines)], capture_output=True, text=True)
+    assert done.stdout.strip() == "none", done.stderr
+    for made in ("extracted/cup/cup.ply", "exports/cup.obj", "renders/cup_sheet.png", "reprojected/report.json"):
+        assert (config.parent / made).exists()
+    assert (tmp_path / "checked/report.json").exists()
+
+
+def test_a_config_is_the_same_with_and_without_nerfstudio(config):
+    whole, plain = load_run_config(config), read_run_config(config)
+    for name in ("get_base_dir", "get_checkpoint_dir"):
+        assert getattr(plain, name)() == getattr(whole, name)()
+    assert plain.data_path == whole.data_path and plain.method_name == whole.method_name
+    for one, other in (
+        (plain.model_config, whole.model_config),
+        (plain.data_config, whole.data_config),
+        (plain.data_config.dataparser, whole.data_config.dataparser),
+    ):
+        for each in fields(one):
+            if each.name != "dataparser":
+                assert getattr(one, each.name) == getattr(other, each.name), each.name
+
+
+def test_a_run_written_without_nerfstudio_is_read_with_it(config, tmp_path):
+    state = {"means": torch.zeros(1)}
+    made = write_run(open_run(config), tmp_path / "plain/run", state, 3)
+    whole = write_run(open_for_training(config), tmp_path / "whole/run", state, 3)
+    one, other = (yaml.dump(load_run_config(path)) for path in (made, whole))
+    assert one == other.replace(str(tmp_path / "whole"), str(tmp_path / "plain")).replace("- whole\n", "- plain\n")
+    assert load_run_config(made).get_base_dir() == tmp_path / "plain/run"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("!!python/name:beags_plugin.plugin.trainer.BeagsTrainer ''", "!!python/name:os.system ''", "names os.system"),
+        ("!!python/object:nerfstudio.configs.base_config.MachineConfig", "!!python/object:os.Machine", "names os.Mach"),
+        ("!!python/object:beags_plugin.core.densification.Den", "!!python/object:beags_plugin.core.gone.Den", "older"),
+        ("run_format: 3", "run_format: 2", "older version"),
+    ],
+)
+def test_what_no_run_needs_is_refused(config, old, new, told):
+    text = config.read_text()
+    assert old in text
+    config.write_text(text.replace(old, new))
+    with pytest.raises(UserError, match=told):
+        read_run_config(config)
+
+
+def test_a_run_with_options_that_are_gone_still_opens(config, tmp_path):
+    gone = "    pyramid: !!python/object:beags_plugin.plugin.options.pyramid.PyramidConfig\n      levels: 2\n    near:"
+    text = config.read_text()
+    assert "    near:" in text
+    config.write_text(text.replace("    near:", gone))
+    assert read_run_config(config).model_config.near == load_run_config(config).model_config.near
+    made = write_run(open_run(config), tmp_path / "part", {}, 3)
+    assert "pyramid" not in made.read_text() and load_run_config(made).model_config.near == 0.01
