@@ -18,7 +18,7 @@ pytest.importorskip("nerfstudio")
 
 from beags_plugin.commands.cli import main
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")

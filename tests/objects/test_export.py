@@ -207,7 +207,7 @@ def test_meshes_of_a_run_lie_where_its_discs_are(trained, tmp_path, monkeypatch)
     from beags_plugin.surfaces import fusion
 
     empty = fusion.Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32), 0.1)
-    monkeypatch.setattr("beags_plugin.export.mesh.fuse", lambda *_: empty)
+    monkeypatch.setattr("beags_plugin.surfaces.meshing.fuse", lambda *_: empty)
     main([*arguments, str(tmp_path / "none"), "--all"])
     manifest = json.loads((tmp_path / "none/manifest.json").read_text())
     assert [path.name for path in (tmp_path / "none").iterdir()] == ["manifest.json"]
