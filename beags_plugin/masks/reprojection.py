@@ -15,8 +15,8 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import LabelMaps, to_int32
 from beags_plugin.ops import cuda_extension, extension
 from beags_plugin.ops.reprojection_votes import reprojection_votes
-from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import each_view
 
 _CHUNK_PIXELS = 1 << 16  # source pixels projected at a time: their temporaries stay in the cache
 _DENSE_COUNTERS = 1 << 26  # most (pixel, class) pairs of a view counted in one array (256 MiB)
@@ -60,8 +60,7 @@ def reproject_pairwise(
     compiled = cuda_extension.supports(*depths)
     size = max(camera.height * camera.width for camera in cameras) * num_classes
     dense = compiled and size <= _DENSE_COUNTERS
-    # a view per thread at a time, each with its own counters; several processes take views one by one
-    threads = extension.threads() if processes.size() == 1 else 1
+    threads = extension.threads()  # a view per thread at a time, each with its own counters
     together = max(1, min(threads, 2 * _DENSE_COUNTERS // size)) if dense else 1
     batches = [range(i, min(i + together, len(cameras))) for i in range(0, len(cameras), together)]
 
@@ -74,7 +73,7 @@ def reproject_pairwise(
         found = reprojection_votes(depths, held, own, towards.to(depths[0].dtype), batch[0], num_classes, tau, IGNORE)
         return list(zip(*found, strict=True))
 
-    for number, results in enumerate(processes.each_view(len(batches), votes)):
+    for number, results in enumerate(each_view(len(batches), votes)):
         for i, result in zip(batches[number], results, strict=True):
             if progress:
                 progress(i + 1, len(cameras))

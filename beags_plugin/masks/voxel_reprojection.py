@@ -16,7 +16,7 @@ from beags_plugin.masks.reprojection import ReprojectedMask, check_counts, check
 from beags_plugin.masks.spatial_chunks import SpatialChunks, divide_space
 from beags_plugin.ops.voxel_votes import votes_for
 from beags_plugin.system.filed_tensors import filed
-from beags_plugin.system.processes import each_view
+from beags_plugin.system.progress import each_view
 
 VOXEL_PIXELS = 1.5  # side of a voxel, in pixels seen at the objects' median depth
 _DOUBTS = 0.95  # share of depths with errors within the second look

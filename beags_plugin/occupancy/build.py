@@ -18,7 +18,7 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, render_class_map, surface_depth
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.filed_tensors import filed
-from beags_plugin.system.processes import each_view
+from beags_plugin.system.progress import each_view
 
 MIN_ALPHA_LIFTED = 0.5  # pixels with less alpha are not lifted
 

@@ -40,7 +40,7 @@ def resume(
     machine = config.machine
     config.check_memory = config.check_memory and check_memory
     if device is not None:
-        machine.device_type, machine.num_devices = device, machine.num_devices if device == "cuda" else 1
+        machine.device_type = device
     check_machine(machine)
     _complete(
         lambda: launch(

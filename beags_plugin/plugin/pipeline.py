@@ -1,4 +1,4 @@
-"""nerfstudio's pipeline, also in one of several processes."""
+"""nerfstudio's pipeline, whose data manager knows whether a base begins."""
 
 from __future__ import annotations
 
@@ -12,11 +12,7 @@ from beags_plugin.system.errors import print_user_errors_plainly
 
 
 class BeagsPipeline(VanillaPipeline):
-    """``VanillaPipeline`` without torch's ``DistributedDataParallel``, which keeps to the parameters it was made with.
-
-    Ours change in number as the scene grows: ``training.optimizers`` averages their gradients, and
-    ``training.replicas`` does the rest.
-    """
+    """``VanillaPipeline``, which tells its data manager whether a base begins, and prints user errors plainly."""
 
     def __init__(
         self,
@@ -31,4 +27,4 @@ class BeagsPipeline(VanillaPipeline):
         model = cast(BeagsModelConfig, config.model)
         data = cast(BeagsDataManagerConfig, config.datamanager)
         data.begins = test_mode == "val" and model.base_steps > 0 and model.start_from is None
-        super().__init__(config, device, test_mode, world_size=1, local_rank=local_rank, **others)
+        super().__init__(config, device, test_mode, world_size, local_rank, **others)

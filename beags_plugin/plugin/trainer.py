@@ -26,7 +26,6 @@ from beags_plugin.plugin.training.checkpoints import Checkpoints
 from beags_plugin.plugin.training.memory_guard import NO_MEMORY, MemoryWatch, check_room, is_out_of_memory
 from beags_plugin.plugin.training.monitor import HeldOutCurve
 from beags_plugin.plugin.training.optimizers import SceneOptimizer
-from beags_plugin.plugin.training.replicas import Replica
 from beags_plugin.plugin.training.resumable import GlobalRandom, Resumable
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.training.timing import Estimate, StageSeconds
@@ -34,7 +33,6 @@ from beags_plugin.plugin.training.warm_start import start_from_scene
 from beags_plugin.plugin.viewer.serving import end_rendering
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.runs.layout import REPORT_FILE
-from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError, is_of_disk, refused, silence_libraries
 from beags_plugin.system.interrupts import Interrupts, stop
 from beags_plugin.system.lock import run_lock
@@ -63,7 +61,6 @@ class BeagsTrainer(Trainer):
         self._watch = MemoryWatch(config.machine.device_type)
         self._done = 0  # the last step that was trained
         self._complete = False
-        self._replica = Replica(config, local_rank)
         super().__init__(config, local_rank, world_size)
         self._checkpoints = Checkpoints(config, self.base_dir, self.checkpoint_dir)
 
@@ -86,20 +83,18 @@ class BeagsTrainer(Trainer):
             raise
 
     def _set_up(self, test_mode: Any) -> None:
-        if processes.rank() == 0:
-            before = noted(self.base_dir)
-            self._lock = run_lock(self.base_dir)
-            self._before = before
-            # At once: config.yml is this run's already, and a resume would take both for one run.
-            self._checkpoints.set_aside()
+        before = noted(self.base_dir)
+        self._lock = run_lock(self.base_dir)
+        self._before = before
+        # At once: config.yml is this run's already, and a resume would take both for one run.
+        self._checkpoints.set_aside()
         check_machine(self.config.machine)
         self.config.check()
         if (start := self._start()) is not None:
             find_importer(start)  # before the data are read
         used = any((self.base_dir / self.config.logging.relative_log_dir).glob("events.out.tfevents.*"))
         super().setup(test_mode)
-        self._replica.start_alike(self._model)
-        if self.config.check_memory and processes.rank() == 0:
+        if self.config.check_memory:
             check_room(self.base_dir, self.config.machine.device_type)
         if used:
             self._forget_events()
@@ -142,7 +137,6 @@ class BeagsTrainer(Trainer):
         if self._lock is not None:
             self._lock.release()
             self._lock = None
-        self._replica.end()
 
     def _close_writers(self, failed: bool = False) -> None:
         for each in writer.EVENT_WRITERS:
@@ -194,8 +188,6 @@ class BeagsTrainer(Trainer):
         if self.config.max_num_iterations == 0:
             if self.loaded_run == self.base_dir.absolute() and not (self.base_dir / REPORT_FILE).exists():
                 return self._write_report()  # killed after its last checkpoint
-            if processes.rank() > 0:
-                return None  # the first process writes the report, or the error
             raise UserError(
                 f"the checkpoint is of a complete run ({self._start_step} steps): nothing is left to train; "
                 "to refine a base, this one or <run>/base/nerfstudio_models, load it with beags-refine."
@@ -238,11 +230,6 @@ class BeagsTrainer(Trainer):
     # -- checkpoints -------------------------------------------------------------------------------------------------
 
     @property
-    def run(self) -> Path:
-        """The run's folder, also in processes that write elsewhere."""
-        return self._replica.run
-
-    @property
     def loaded_run(self) -> Path | None:
         """The folder of the run that this one resumes; None where nothing was loaded."""
         return self._checkpoints.loaded_run
@@ -279,7 +266,7 @@ class BeagsTrainer(Trainer):
 
     def stop_if_asked(self, step: int) -> None:
         """Save the step before ``step`` and end, if a signal asked for that or memory is running out."""
-        if processes.in_any(self._interrupts.asked is not None):
+        if self._interrupts.asked is not None:
             if step > self._start_step:
                 self._save_once(step - 1)
             raise KeyboardInterrupt
@@ -314,8 +301,7 @@ class BeagsTrainer(Trainer):
         self.save_checkpoint(self._done)
         self._complete = True
         self._write_report()
-        if processes.rank() == 0:
-            decide(self.base_dir / CONFIG_FILE)
+        decide(self.base_dir / CONFIG_FILE)
         super()._after_train()
 
     def _write_report(self) -> None:

@@ -18,7 +18,7 @@ from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.preparation.refiner import Progress
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
-from beags_plugin.system.processes import each_view
+from beags_plugin.system.progress import each_view
 
 AUTO = "auto"  # pairwise up to the two limits, else voxel
 PAIRWISE_PIXELS = 100_000_000  # in all views; pairwise holds 5 bytes for each: 0.5 GB

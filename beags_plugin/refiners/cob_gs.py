@@ -27,7 +27,7 @@ from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.refiners import mask_logits
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.filed_tensors import filed
-from beags_plugin.system.processes import each_view
+from beags_plugin.system.progress import each_view
 
 RATES = {"features_dc": 2.5e-3, "features_rest": 1.25e-4, "opacities": 0.025, "scales": 0.005, "quats": 0.001}
 POSITION_RATE = 1.6e-6  # times the scene's extent: the last one of the base

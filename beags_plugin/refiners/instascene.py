@@ -25,8 +25,7 @@ from beags_plugin.preparation.refiner_training import Edit, OwnTraining, Terms, 
 from beags_plugin.refiners import mask_tracking, prototypes
 from beags_plugin.refiners.drawn_alone import FrozenDrawing
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.processes import each_view
-from beags_plugin.system.progress import say
+from beags_plugin.system.progress import each_view, say
 
 RATE = 0.025  # of the features: Adam with eps 1e-15, constant
 SAMPLES = 32_768

@@ -13,7 +13,6 @@ from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.preparation.refiner_training import TrainedScene
 from beags_plugin.rasterizers.rendering import draw_features, surfel_inputs
 from beags_plugin.refiners import identity_codes
-from beags_plugin.system import processes
 from beags_plugin.system.progress import say
 
 LEAST_RIGHT = 0.97  # of the labelled training pixels: with less, codes and classifier have not learned the masks
@@ -50,11 +49,10 @@ class LearnedCodes:
         return draw_features(self.scene.rasterizer, inputs, self.codes, camera, self.scene.settings)
 
     def step(self) -> None:
-        """Let both learn from the gradients of a step, if there are any in any process."""
-        if processes.in_any(any(values.grad is not None for values in self.learned)):  # not where no view had a mask
+        """Let both learn from the gradients of a step, if there are any."""
+        if any(values.grad is not None for values in self.learned):  # not where no view had a mask
             for values in self.learned:
                 values.grad = torch.zeros_like(values) if values.grad is None else values.grad
-            processes.average(values.grad for values in self.learned if values.grad is not None)
             self.adam.step()
 
     def say_right_pixels(self, surfels: Surfels, ranks: ClassRanks) -> None:

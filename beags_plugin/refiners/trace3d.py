@@ -26,7 +26,7 @@ from beags_plugin.preparation.refiner_training import Edit, OwnTraining, Terms, 
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.refiners import instance_tracing as tracing
 from beags_plugin.system.errors import UserError, check_choice
-from beags_plugin.system.processes import each_view
+from beags_plugin.system.progress import each_view
 
 WEIGHTS = ("count", "alpha")
 RATES = {"features_dc": 2.5e-3, "features_rest": 1.25e-4, "opacities": 0.05, "scales": 0.005, "quats": 0.001}

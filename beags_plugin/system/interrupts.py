@@ -12,7 +12,6 @@ from rich import get_console
 from rich.markup import escape
 
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.processes import is_first
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -44,8 +43,7 @@ class Interrupts:
         again, self.asked = self.asked is not None, number
         if again or self.at_once:
             raise KeyboardInterrupt
-        if is_first():
-            get_console().print("Stopping after this step, and saving it. Once more ends at once.", highlight=False)
+        get_console().print("Stopping after this step, and saving it. Once more ends at once.", highlight=False)
         self._wake()
 
     @property

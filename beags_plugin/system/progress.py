@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 A_MOMENT = 2.0  # seconds
 
 Item = TypeVar("Item")
+Result = TypeVar("Result")
 Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
 """Shows a progress bar of that name, as ``progress_bar`` does."""
 
@@ -62,3 +63,17 @@ def counted(items: Iterable[Item], total: int, progress: Callable[[int, int], No
     for done, item in enumerate(items, start=1):
         yield item
         progress(done, total)
+
+
+def each_view(
+    count: int, work: Callable[[int], Result], progress: Callable[[int, int], None] | None = None
+) -> Iterator[Result]:
+    """Yield ``work(0)``, .., ``work(count - 1)``, one after the other, as they are asked for.
+
+    progress: called with (done, count).
+    """
+    for index in range(count):
+        result = work(index)
+        if progress:
+            progress(index + 1, count)
+        yield result

@@ -22,6 +22,7 @@ from beags_plugin.objects.written_back import changes, format_of
 from beags_plugin.surfaces.closing_surfels import joined
 
 
+@pytest.mark.slow("refines a scene of another program")
 def test_a_scene_is_refined_and_written_back_in_its_format(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     scene = write_start_scene(tmp_path / "data")
@@ -58,6 +59,7 @@ def test_a_scene_is_refined_and_written_back_in_its_format(tmp_path, monkeypatch
     assert "is not of beags clean" in " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.slow("refines a scene of another program")
 def test_masks_are_made_where_there_are_none_and_gaussians_with_volume_are_polished(tmp_path, monkeypatch, capsys):
     """As from photos that have poses alone; what stands out in them is found by a source of masks, here a given one."""
     monkeypatch.chdir(tmp_path)

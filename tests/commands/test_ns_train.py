@@ -40,6 +40,7 @@ def ns_train(tmp_path_factory):
     return run
 
 
+@pytest.mark.slow("starts ns-train, which imports for seconds")
 def test_help_imports_nothing_for_other_methods_and_warns_of_nothing(ns_train):
     done = ns_train("beags", "--help")
     assert done.returncode == 0 and "The options that people set first" in done.stdout
@@ -48,6 +49,7 @@ def test_help_imports_nothing_for_other_methods_and_warns_of_nothing(ns_train):
     assert said.split() == ["0", "False"]
 
 
+@pytest.mark.slow("starts ns-train, which imports for seconds")
 def test_a_misspelt_preset_is_answered_with_the_presets(ns_train):
     done = ns_train("beags-fsat", "--data", "x")
     assert done.returncode == 2 and done.stdout == ""

@@ -31,6 +31,8 @@ pytest.importorskip("nerfstudio")
 
 from viewer_pages import free_port
 
+pytestmark = pytest.mark.slow("every command of README, one after the other: three trainings")
+
 BIN = Path(sys.executable).parent
 PROGRAM = re.compile(r"(beags|ns-[a-z]+|make|pip|python) |scripts/")
 README = "\n".join((ROOT / page).read_text("utf8") for page in ("README.md", "docs/commands.md"))

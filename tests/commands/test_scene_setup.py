@@ -72,6 +72,7 @@ def files(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
+@pytest.mark.slow("finds poses of photos made for it")
 def test_photos_alone_are_trained_on_with_poses_and_masks_once(photos, tmp_path, trainings, monkeypatch, capsys):
     before = files(photos)
     demo.run_demo(photos, tmp_path / "out", None, None, 0, False)
@@ -145,6 +146,7 @@ def test_a_network_that_finds_nothing_is_a_user_error(posed, tmp_path):
     assert not any((tmp_path / "out/made").rglob("*.png"))
 
 
+@pytest.mark.slow("finds poses of photos made for it")
 def test_masks_of_photos_without_poses_are_taken(photos, tmp_path, monkeypatch):
     scene = tmp_path / "given"
     scene.mkdir()

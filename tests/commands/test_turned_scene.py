@@ -20,6 +20,8 @@ from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.posing.process import NothingFits
 from beags_plugin.system.errors import UserError
 
+pytestmark = pytest.mark.slow("poses are found anew from photos of each scene")
+
 PHOTOS = 12
 _y, _x = np.mgrid[:HEIGHT, :WIDTH]
 THING = (_x - WIDTH / 2) ** 2 + (_y - HEIGHT / 2) ** 2 < 80**2  # [H, W] bool: where every photo shows it

@@ -149,6 +149,7 @@ def test_both_file_types_share_one_mesh(item):
     assert glb.mesh(item) is obj.mesh(item)
 
 
+@pytest.mark.slow("fuses a voxel grid of hundreds of MB")
 def test_fewer_faces_keep_bounds_surface_and_colours(thing, item, mesh):
     few = decimated(mesh, 3000)
     assert 2900 <= len(few.faces) <= 3000 < len(mesh.faces) / 10 and len(few.vertices) == len(np.unique(few.faces))
@@ -234,6 +235,7 @@ def test_voxels_grow_to_keep_the_memory():
     assert voxel > 2.0 / 4096 and 100 < _grid_mb(high, voxel, 8.0) <= 200
 
 
+@pytest.mark.slow("fuses a voxel grid of hundreds of MB")
 def test_the_grid_keeps_its_bound(item, monkeypatch):
     """All blocks that Open3D allocates, at 20 bytes a voxel, stay within the bound."""
     from beags_plugin.surfaces import fusion

@@ -157,6 +157,7 @@ def test_mistakes(tmp_path, monkeypatch):
 
 
 @NEEDED
+@pytest.mark.slow("a browser draws by WebGL in software")
 def test_a_browser_draws_the_object_and_asks_no_network(tmp_path, cup):
     """The page from a disk, against our own picture from the same place."""
     rendered: list[int] = []

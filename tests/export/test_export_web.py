@@ -202,6 +202,7 @@ def test_colours_of_transparent_gaussians_stay(tmp_path):
     assert (back.sh_dc - in_order(surfels).sh_dc).abs().mean() < 0.005
 
 
+@pytest.mark.slow("clusters 65,000 colours")
 def test_many_gaussians_share_a_palette(tmp_path):
     """Above 1,024 Gaussians the higher bands are clustered: four Gaussians an entry."""
     near = random_surfels(count=8000, degree=1)
@@ -225,6 +226,7 @@ def test_tables_of_numbers():
     assert few.tolist() == [1.0, 3.0, 3.0, 3.0] and nearest(few, np.array([0.9, 5.0])).tolist()[0] == 0
 
 
+@pytest.mark.slow("clusters 65,000 colours")
 def test_a_palette_is_the_same_on_any_number_of_threads(tmp_path):
     vectors = np.random.default_rng(0).normal(size=(3000, 9))
     np.save(tmp_path / "v.npy", vectors)

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
+import pytest
 import torch
 from ball_scenes import SIDE, balls_from, issues, poses, write_balls, write_model
 from data_folders import write_image
@@ -66,6 +67,7 @@ def test_masks_that_are_made_are_compared_too(tmp_path, capsys):
     assert "worst first: v03 leaves out" in capsys.readouterr().out and (tmp_path / "out/contradicted.png").is_file()
 
 
+@pytest.mark.slow("a capture of 60 views with masks damaged in several ways")
 def test_damaged_masks_of_a_capture_are_named_and_no_others(tmp_path):
     from beags_plugin.objects.check_masks import check_scene, data_options
     from benchmarks.masks import damaged_mask

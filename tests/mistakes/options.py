@@ -59,8 +59,8 @@ mistakes(
         "no random points": trained("beags-data", "--num-random-points", "0"),
         "a negative number of random points": trained("beags-data", "--num-random-points", "-5"),
         "a device that is not there": trained("--machine.device-type", "cuda"),
-        "several processes on a CPU": trained("--machine.num-devices", "2"),
-        "no process": trained("--machine.num-devices", "0"),
+        "several devices": trained("--machine.num-devices", "2"),
+        "no device": trained("--machine.num-devices", "0"),
         "a learning rate that is not a number": trained("--pipeline.model.position-lr", "nan", "nan"),
     },
 )

@@ -34,6 +34,7 @@ def age(folder: Path, seconds: float) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="processes are forked")
+@pytest.mark.slow("kills an export once in each format")
 def test_a_killed_export_leaves_whole_files_and_no_manifest_in_any_format(trained, tmp_path):
     formats = formats_here()
     assert len(formats) >= 5

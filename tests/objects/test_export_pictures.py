@@ -171,6 +171,7 @@ def written(config, tmp_path_factory) -> Path:
 @pytest.mark.parametrize("frame", ["world", "object"])
 @pytest.mark.parametrize("suffix", ["glb", "obj"])
 @pytest.mark.parametrize("name", OBJECTS.values())
+@pytest.mark.slow("fuses and textures meshes as large as in use")
 def test_a_mesh_looks_like_its_splats(written, splats, views, name, suffix, frame):
     mesh = read(written / f"{frame}/{name}.{suffix}")
     if frame == "object":

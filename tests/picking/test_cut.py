@@ -203,6 +203,7 @@ print(hashlib.sha256(cutter._graph.weights.tobytes() + found.numpy().tobytes()).
 """
 
 
+@pytest.mark.slow("the same cut three times")
 def test_bits_are_the_same_for_one_and_for_three_threads():
     digests = set()
     for threads in ("1", "3"):

@@ -123,6 +123,7 @@ def test_photos_that_fit_nowhere_are_named_and_sizes_counted(tmp_path):
     assert "x0.png, x1.png, x2.png have no pose" in said
 
 
+@pytest.mark.slow("finds poses of photos made for it")
 def test_groups_blur_repeats_and_kinds_of_photos_get_a_sentence_each(tmp_path):
     photos = tmp_path / "photos"
     write_photos(photos, 9, "a")
@@ -140,6 +141,7 @@ def test_groups_blur_repeats_and_kinds_of_photos_get_a_sentence_each(tmp_path):
     assert sorted(set(lenses)) == [240, 320]
 
 
+@pytest.mark.slow("finds poses of photos made for it")
 def test_the_middle_of_a_lens_is_found_where_it_is_far_from_that_of_the_photo(tmp_path):
     given = write_photos(tmp_path / "photos", 14, shift=(14.0, -9.0))
     process(tmp_path / "photos", tmp_path / "scene", quiet)
@@ -147,6 +149,7 @@ def test_the_middle_of_a_lens_is_found_where_it_is_far_from_that_of_the_photo(tm
     assert np.median(turned) < 0.4  # 14 pixels are 2.7 degrees
 
 
+@pytest.mark.slow("finds poses of photos made for it")
 def test_on_a_turntable_masks_find_the_poses_of_what_turns(tmp_path, capsys):
     """A room that stands before the camera fills most of each photo; the masks lie where training finds them."""
     photos, scene = tmp_path / "photos", tmp_path / "scene"

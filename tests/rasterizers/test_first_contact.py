@@ -71,12 +71,14 @@ def test_what_differs_is_named(backend, sentence):
     assert difference(backend(), "cpu") == sentence
 
 
+@pytest.mark.slow("each trial is a process that imports torch")
 def test_a_child_that_agrees_and_one_that_differs():
     assert try_in_child("tried_backends:Agrees", ["cpu", "cpu"]) == ""
     reason = try_in_child("tried_backends:DrawsWrongly", ["cpu"])
     assert reason == "the image depth differs from the torch reference's in float64"
 
 
+@pytest.mark.slow("each trial is a process that imports torch")
 def test_a_child_that_crashes_or_fails():
     assert try_in_child("tried_backends:Crashes", ["cpu"]) == "drawing a small scene ended with SIGSEGV"
     reason = try_in_child("tried_backends:Raises", ["cpu"])
@@ -86,6 +88,7 @@ def test_a_child_that_crashes_or_fails():
     assert try_in_child("tried_backends:Chatters", ["cpu"]).endswith("ended without a result (Bye.)")
 
 
+@pytest.mark.slow("each trial is a process that imports torch")
 def test_a_child_that_hangs_is_ended():
     began = time.monotonic()
     assert try_in_child("tried_backends:Hangs", ["cpu"], 3.0) == "a small scene was not drawn within 3 seconds"
@@ -115,6 +118,7 @@ def test_a_bad_verdict_is_kept_too_and_renewed_when_the_build_changes():
     assert verdict(mended, anew=True).reason == "" and verdict(mended).reason == ""
 
 
+@pytest.mark.slow("each trial is a process that imports torch")
 def test_a_gpu_that_others_have_filled_is_tried_again():
     full = contact("OutOfMemory")
     assert "out of memory" in verdict(full).reason

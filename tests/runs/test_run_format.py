@@ -58,6 +58,7 @@ def ns_eval(config: Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("older", [first_format, without_version])
+@pytest.mark.slow("starts nerfstudio's programs, which import for seconds")
 def test_programs_of_nerfstudio_say_the_same_of_an_older_run(run, tmp_path, older):
     path = tmp_path / "config.yml"
     path.write_text(older(run.read_text("utf8")), "utf8")
@@ -66,6 +67,7 @@ def test_programs_of_nerfstudio_say_the_same_of_an_older_run(run, tmp_path, olde
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow("starts nerfstudio's programs, which import for seconds")
 def test_programs_of_nerfstudio_print_one_sentence_for_bad_data(run, tmp_path):
     path = write_trained(tmp_path / "run", write_scene(tmp_path / "data"))
     (tmp_path / "data/transforms.json").write_text("{")
@@ -85,6 +87,7 @@ assert ViewerConfig().websocket_host == ViewerConfig.websocket_host == "0.0.0.0"
 """
 
 
+@pytest.mark.slow("starts nerfstudio's programs, which import for seconds")
 def test_other_methods_are_left_as_they_are():
     done = subprocess.run([sys.executable, "-c", IMPORT], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

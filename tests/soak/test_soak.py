@@ -23,6 +23,8 @@ from parser_targets import TARGETS, Target, examine
 
 from beags_plugin.system import whole_files
 
+pytestmark = pytest.mark.slow("a training of thousands of steps, for its memory")
+
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_changed_files_are_taken_or_refused(name):

@@ -106,6 +106,7 @@ def test_a_hole_that_lies_open_stays_open(monkeypatch):
     assert len(found.surfels) == len(found.class_ids) == 0
 
 
+@pytest.mark.slow("fuses the surfaces of a whole scene")
 def test_the_box_is_closed_and_not_lined_within():
     """With nothing patched: drawn alone, it shows its inside through the hole, which would be taken for its surface."""
     surfels, ids, _ = stacked()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from beags_plugin.system import progress
-from beags_plugin.system.progress import counted, progress_bar
+from beags_plugin.system.progress import counted, each_view, progress_bar
 
 
 def clock(monkeypatch, seconds_per_call: float) -> None:
@@ -51,3 +51,17 @@ def test_errors_come_through_and_leave_no_bar(capsys):
         with pytest.raises(ValueError, match="wolf"), progress_bar("Counting sheep", passing) as update:
             update(1, 2)
             raise ValueError("wolf")
+
+
+def test_views_come_one_after_the_other_as_they_are_asked_for():
+    calls, reported = [], []
+
+    def work(index):
+        calls.append(index)
+        return index * index
+
+    views = each_view(4, work, lambda done, count: reported.append((done, count)))
+    assert next(views) == 0 and calls == [0]  # nothing is done before it is asked for
+    assert list(views) == [1, 4, 9]
+    assert reported == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert list(each_view(0, work)) == []

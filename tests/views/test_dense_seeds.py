@@ -44,6 +44,7 @@ def manager(data) -> BeagsDataManager:
     return manager_of(data)
 
 
+@pytest.mark.slow("sweeps planes through a scene's photos")
 def test_they_lie_on_surfaces_in_the_colours_that_photos_have(data, manager):
     points, colors = seeds_of(manager)
     assert len(points) == len(colors) and len(points) > 900 and colors.dtype == torch.uint8
@@ -66,6 +67,7 @@ def test_they_lie_on_surfaces_in_the_colours_that_photos_have(data, manager):
     assert np.quantile(alike, 0.8) < 32, "of 255"
 
 
+@pytest.mark.slow("sweeps planes through a scene's photos")
 def test_they_are_the_same_for_any_number_of_threads(data, manager, monkeypatch):
     from beags_plugin.posing import dense_points as made
 

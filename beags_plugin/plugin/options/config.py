@@ -28,7 +28,7 @@ from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.runs.run_config import BEGINNINGS, MOVED
 from beags_plugin.system.errors import UserError, print_user_errors_plainly, writing
 from beags_plugin.system.interrupts import stop
-from beags_plugin.system.lock import lock_ahead, run_lock
+from beags_plugin.system.lock import lock_ahead
 from beags_plugin.system.output_option import OUTPUT_DIR
 from beags_plugin.system.pasted import quoted
 from beags_plugin.system.registry import load
@@ -181,8 +181,6 @@ class BeagsTrainerConfig(TrainerConfig):
         if (start := self.model_config.start_from) is not None:
             self.model_config.start_from = Path(start).absolute()
         write_text_atomically(config_text(self), self.get_base_dir() / CONFIG_FILE)
-        if self.machine.num_devices * self.machine.num_machines > 1:  # the training is in processes of its own
-            run_lock(self.get_base_dir()).release()
 
 
 def _read_by_nerfstudio(loader: yaml.constructor.SafeConstructor, node: yaml.Node) -> Iterator[BeagsTrainerConfig]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from nerfstudio.configs.base_config import MachineConfig
 
 from beags_plugin.ops import cuda_extension
@@ -17,21 +16,15 @@ def default_device() -> str:
 
 
 def check_machine(machine: MachineConfig) -> None:
-    """Raise ``UserError`` for missing devices."""
+    """Raise ``UserError`` for a missing device, or several."""
     for name in ("num_devices", "num_machines"):
-        if (count := getattr(machine, name)) < 1:
-            raise UserError(f"--machine.{name.replace('_', '-')} is {count}: give 1 or more.")
-    if machine.device_type == "cuda":
-        if reason := cuda_extension.status()[1]:
+        if (count := getattr(machine, name)) != 1:
             raise UserError(
-                f"--machine.device-type cuda: {reason} Or train with --machine.device-type cpu (beags resume: --device "
-                "cpu)."
+                f"--machine.{name.replace('_', '-')} is {count}: a scene is trained on one device, so leave it at 1; "
+                "docs/experiments.md says how to train several scenes at once."
             )
-        there = torch.cuda.device_count()
-        if machine.num_devices > there:
-            raise UserError(f"--machine.num-devices is {machine.num_devices}, but this machine has {there} GPU(s).")
-    elif machine.num_devices * machine.num_machines > 1:
+    if machine.device_type == "cuda" and (reason := cuda_extension.status()[1]):
         raise UserError(
-            f"--machine.num-devices is {machine.num_devices}, but nerfstudio starts several processes for GPUs only: "
-            "leave it at 1 on a CPU, where one process uses all cores."
+            f"--machine.device-type cuda: {reason} Or train with --machine.device-type cpu (beags resume: --device "
+            "cpu)."
         )

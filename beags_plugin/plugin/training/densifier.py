@@ -16,7 +16,6 @@ from beags_plugin.plugin.training.near_growth import NearVotes, on_objects, shar
 from beags_plugin.plugin.training.scene_edits import edit_scene, move_adam_state
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
-from beags_plugin.system import processes
 from beags_plugin.system.progress import say
 
 SHARPEN_EVERY = 50  # steps between two rounds of growth in a refinement that sharpens
@@ -52,10 +51,10 @@ class Densifier:
         return {"total": found.total, "views": found.views, "frees": self.free is not None, **near}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on gathering, in the first process alone: a checkpoint lacks the statistics of the others."""
+        """Go on gathering."""
         if not state["frees"]:
             self.free = None
-        if processes.rank() == 0 and len(state["total"]) == self.model.num_points:
+        if len(state["total"]) == self.model.num_points:
             kept = self.statistics
             kept.total, kept.views = state["total"].clone().to(kept.total), state["views"].clone().to(kept.views)
             if self.near is not None and "near" in state:
@@ -98,11 +97,9 @@ class Densifier:
     def _densify(self, step: int) -> None:
         model = self.model
         surfels = model.surfels().detach()
-        processes.add_up([self.statistics.total, self.statistics.views])
         units = length_units(surfels.means, self.camera_centers, float(model.extent), self.config)
         gradient, apart = self.statistics.mean(), None
         if self.near is not None:
-            processes.add_up([self.near.shown, self.near.inside])
             apart = self.near.near(), self.most_near
         if model.schedule.refining(step - 1):
             of_objects = model.class_ids != BACKGROUND

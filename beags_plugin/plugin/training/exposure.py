@@ -13,14 +13,12 @@ from beags_plugin.core.exposure import Exposures, Gains, gains, sightings
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.losses.reduction import ordered_linear
 from beags_plugin.options.schedule import log_linear
-from beags_plugin.plugin.training.prepared_files import bar
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.plugin.views.dataparser import BeagsDataParser
 from beags_plugin.surfaces.baking import interpolated
 from beags_plugin.surfaces.color import linear_from_srgb
-from beags_plugin.system import processes
-from beags_plugin.system.progress import counted, say
+from beags_plugin.system.progress import counted, progress_bar, say
 from beags_plugin.views.views import View, in_unit_range
 
 LEAST_SPREAD = 0.05  # EV; photos whose gains differ by less are taken to be of one exposure
@@ -66,19 +64,15 @@ class PhotoExposures:
         return ordered_linear(colors, affine[:, :3], affine[:, 3])
 
     def after_step(self, step: int) -> None:
-        """Move the transforms of the photos that this step saw by its gradients."""
+        """Move the transform of the photo that this step saw by its gradient."""
         gradient = self.affine.grad
         if self._seen is None or gradient is None:
             return
         with torch.no_grad():
-            gradient[self._seen] += 2.0 * TOWARDS_START * (self.affine[self._seen] - self.start[self._seen])
-            seen = torch.zeros(len(self.affine))
-            seen[self._seen] = 1.0
-            processes.add_up([seen])
-            processes.average([gradient])
+            photo = self._seen
+            gradient[photo] += 2.0 * TOWARDS_START * (self.affine[photo] - self.start[photo])
             rate = log_linear(*RATES, self.model.schedule.progress(step))
-            for photo in seen.nonzero()[:, 0].tolist():
-                self.affine[photo] -= rate * self._direction(photo, gradient[photo])
+            self.affine[photo] -= rate * self._direction(photo, gradient[photo])
             self.affine -= self.affine.mean(dim=0) - self.identity
         self.affine.grad, self._seen = None, None
 
@@ -138,7 +132,7 @@ def photo_gains(datamanager: BeagsDataManager) -> Gains | None:
     if not any((ids >= 0).any() for ids, _ in tracks):
         return None
     places, light = [], []
-    with bar("Comparing exposures", passing=True) as progress:
+    with progress_bar("Comparing exposures", passing=True) as progress:
         for index, view in enumerate(counted(datamanager.views("train"), len(tracks), progress)):
             held = view.data()
             image = in_unit_range(held["image"]).cpu()

@@ -10,7 +10,6 @@ from torch.cuda.amp.grad_scaler import GradScaler
 from torch.nn import Parameter
 
 from beags_plugin.plugin.training.timing import StepClock
-from beags_plugin.system import processes
 
 SCENE = "scene"  # name of the one optimizer, for nerfstudio and in checkpoints
 
@@ -37,10 +36,9 @@ class SceneOptimizer(Optimizers):
         self.parameters = {SCENE: [value for parameters in param_groups.values() for value in parameters]}
 
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
-        """Average the gradients of all processes, clip those of groups whose config says so, and step."""
+        """Clip the gradients of groups whose config says so, and step."""
         self.clock.mark("backward")
         groups = self.adam.param_groups  # not `self.parameters`: those are the ones that training began with
-        processes.average(v.grad for group in groups for v in group["params"] if v.grad is not None)
         norms = {group["name"]: self.config[group["name"]]["optimizer"].max_norm for group in groups}
         if any(norm is not None for norm in norms.values()):
             grad_scaler.unscale_(self.adam)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +14,10 @@ from beags_plugin.labels.classes import write_mask
 from beags_plugin.plugin.training.contradiction import Residuals
 from beags_plugin.preparation.pipeline import Preparation
 from beags_plugin.runs.prepared import PREPARATION_REPORT
-from beags_plugin.system import processes
 from beags_plugin.system.errors import writing
 from beags_plugin.system.memory import peak_memory_mb
 from beags_plugin.system.progress import counted, progress_bar
 from beags_plugin.system.whole_files import write_text_atomically, write_whole
-
-
-def bar(name: str, passing: bool = False) -> AbstractContextManager[Callable[[int, int], None]]:
-    """Open a progress bar, in the first of several processes."""
-    return progress_bar(name, passing) if processes.rank() == 0 else nullcontext(lambda done, total: None)
 
 
 def save_prepared(prepared: Preparation, names: list[str], folder: Path, fit: Residuals | None = None) -> None:
@@ -38,7 +30,7 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path, fit: Re
         clear(folder)
         (folder / "masks").mkdir(parents=True, exist_ok=True)
         (folder / "confidence").mkdir(exist_ok=True)
-    with bar("Keeping masks", passing=True) as progress:
+    with progress_bar("Keeping masks", passing=True) as progress:
         for index, name in enumerate(counted(names, len(names), progress)):
             labels = prepared.labels[index]
             write_mask(folder / "masks" / f"{name}.png", labels.cpu().numpy().astype(np.uint16))

@@ -18,7 +18,7 @@ from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.training.contacts import close_contacts
 from beags_plugin.plugin.training.contradiction import residuals
-from beags_plugin.plugin.training.prepared_files import bar, clear, save_prepared
+from beags_plugin.plugin.training.prepared_files import clear, save_prepared
 from beags_plugin.plugin.training.resumable import TrainingRun
 from beags_plugin.plugin.training.scene_edits import apply_edit
 from beags_plugin.plugin.training.scene_model import SceneModel
@@ -30,7 +30,7 @@ from beags_plugin.runs.layout import BASE_SNAPSHOT, PREPARED
 from beags_plugin.runs.prepared import prepared_labels, read_grid
 from beags_plugin.runs.write import write_run
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.progress import counted
+from beags_plugin.system.progress import counted, progress_bar
 
 NOTHING_TO_SAVE = -1  # instead of a step
 
@@ -165,7 +165,7 @@ class RefinementSwitch:
             with (
                 self.trainer.long_stage(NOTHING_TO_SAVE),
                 released(self.trainer.train_lock),
-                bar("Closing what neighbours hide") as progress,
+                progress_bar("Closing what neighbours hide") as progress,
             ):
                 edit, line = close_contacts(self.model, self.datamanager, progress)
             apply_edit(self.model, self.trainer.optimizers.adam, edit)
@@ -186,7 +186,7 @@ class RefinementSwitch:
         with self.trainer.long_stage(step):
             whole = self.datamanager.views("train", original=True)
             views = [*whole, *self.datamanager.close_up_views()]
-            with bar("Reading masks", passing=True) as progress:
+            with progress_bar("Reading masks", passing=True) as progress:
                 masks = LabelMaps(view.labels for view in counted(views, len(views), progress))
             fit = residuals(model, whole, masks[: len(whole)]) if self.datamanager.config.photos == "all" else None
             with released(self.trainer.train_lock):  # minutes, which only read the scene: a viewer may render it
@@ -202,7 +202,7 @@ class RefinementSwitch:
                     background_voxels=self._background_voxels(),
                     seed=model.seed,
                     scale=self._scale(),
-                    stage=bar,
+                    stage=progress_bar,
                 )
             for line in prepared.summary:
                 CONSOLE.print(f"  {line}", highlight=False, markup=False)
@@ -241,7 +241,7 @@ class RefinementSwitch:
 
     def _join_base(self) -> None:
         views = self.datamanager.views("train")
-        with bar("Reading masks", passing=True) as progress:
+        with progress_bar("Reading masks", passing=True) as progress:
             scene = self._scene(LabelMaps(view.labels for view in counted(views, len(views), progress)))
         if not bool(self.model.assigned):  # those of a resumed run have their classes
             self.model.take_members(Membership(self.refiner.seed_classes(scene)))
@@ -269,7 +269,7 @@ class RefinementSwitch:
             base_steps=model.schedule.base_steps,
             extent=model.extent_on_host(),
             scale=self._scale(),
-            stage=bar,
+            stage=progress_bar,
         )
 
     def _restore_files(self) -> None:
@@ -293,7 +293,7 @@ class RefinementSwitch:
                 f"the occupancy loss to False, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
             )
         views = [*self.datamanager.views("train"), *self.datamanager.close_up_views()]
-        with bar("Reading masks", passing=True) as progress:
+        with progress_bar("Reading masks", passing=True) as progress:
             labels = LabelMaps(
                 prepared_labels(folder / "masks" / f"{view.name}.png", view.camera).to(self.model.device)
                 for view in counted(views, len(views), progress)

@@ -23,7 +23,6 @@ from beags_plugin.labels.class_ids import IGNORE, objects_in
 from beags_plugin.labels.label_maps import CompressedMap, to_compact, to_int32
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.plugin.views.dataset import BeagsDataset
-from beags_plugin.system import processes
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
 from beags_plugin.views.cameras import camera_from_nerfstudio, take_intrinsics
@@ -130,10 +129,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     # -- batches -----------------------------------------------------------------------------------------------------
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
-        own = processes.rank()  # each process takes a view of its own, from an order that all have
-        self._pass_over(own)
         camera, data = super().next_train(step)
-        self._pass_over(processes.size() - own - 1)
         if isinstance(self.cached_train, StreamedViews):
             self.cached_train.expect(self.train_unseen_cameras)
         metadata = camera.metadata or {}
@@ -167,13 +163,6 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         if index not in self._cameras:
             self._cameras[index] = camera_from_nerfstudio(self.train_dataset.cameras, index).to(self.device)
         return self._cameras[index]
-
-    def _pass_over(self, count: int) -> None:
-        """Leave out training views, which other processes take."""
-        for _ in range(count):
-            self.train_unseen_cameras.pop(0)
-            if not self.train_unseen_cameras:
-                self.train_unseen_cameras = self.sample_train_cameras()
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
         index = self.eval_unseen_cameras.pop(self._eval_order.randrange(len(self.eval_unseen_cameras)))

@@ -272,6 +272,7 @@ def test_colours_are_those_that_the_photo_shows():
 
 
 @pytest.mark.parametrize(("step", "after"), [(20, True), (44, True), (50, False)])
+@pytest.mark.slow("two trainings each")
 def test_a_killed_run_ends_as_the_whole_one(folder, whole, tmp_path, monkeypatch, step, after):
     run, data = tmp_path / "run", folder(**EXPOSED)
     interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, step, after))
@@ -295,6 +296,7 @@ def test_curves_and_evaluation_take_the_fit_for_exposures(whole, short_run):
     assert "psnr_fit" not in plain and not evaluate_run(short_run / "run/config.yml").after.colors_fitted
 
 
+@pytest.mark.slow("two trainings each")
 def test_the_number_of_threads_is_no_matter(folder, whole, tmp_path):
     before = torch.get_num_threads()
     torch.set_num_threads(2 if before == 1 else 1)

@@ -147,6 +147,7 @@ def test_objects_of_every_refiner_are_extracted_and_exported(refined, tmp_path, 
 
 
 @pytest.mark.parametrize("name", RUNS)
+@pytest.mark.slow("a training for each refiner")
 def test_the_viewer_shows_the_objects_of_every_refiner(refined, name, monkeypatch):
     """Each isolated: the Gaussians that the run holds for it, drawn as if there were no others."""
     config = refined(name) / "config.yml"
@@ -291,6 +292,7 @@ def test_a_joint_base_grows_with_the_classes_of_its_seeds(data, tmp_path, monkey
     # of cob-gs also where the next object begins, and after a checkpoint that follows this
     [*((name, step) for name in OWN for step in (0, 2, 7)), ("cob-gs", 14), ("cob-gs", 20), ("sagd", 0)],
 )
+@pytest.mark.slow("a training for each refiner")
 def test_a_killed_run_ends_as_the_whole_one(refined, data, tmp_path, monkeypatch, name, step):
     run = tmp_path / "run"
     changes = overrides(name, **RUNS[name])

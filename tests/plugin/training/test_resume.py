@@ -191,6 +191,7 @@ def test_a_kill_between_the_last_checkpoint_and_the_report(data, whole, tmp_path
     assert_same_run(run, whole)
 
 
+@pytest.mark.slow("trains until it is killed, and on")
 def test_a_real_kill(data, whole, tmp_path):
     """SIGKILL from outside while a process trains."""
     run = tmp_path / "run"

@@ -286,6 +286,7 @@ def test_sides_are_far_from_the_clicks_and_from_one_another():
     assert other_sides(cameras, 100.0 * torch.ones(3, dtype=torch.float64), []) == []
 
 
+@pytest.mark.slow("cuts, writes and opens a run several times")
 def test_what_is_kept_is_the_runs_for_every_command(opened):
     tab, config = opened()
     run = config.parent
@@ -350,6 +351,7 @@ def test_an_object_of_the_run_is_corrected_and_the_run_remembers(opened):
     assert torch.equal(tab.viewing.model.members().class_ids, after.members.class_ids)
 
 
+@pytest.mark.slow("cuts, writes and opens a run several times")
 def test_an_extracted_run_is_corrected_and_drawn_and_the_run_that_it_is_from_stays(opened, tmp_path):
     """The object has floor about it. A click on it alone takes all that there is, so that nothing is picked anew."""
     config, _ = write_solids_run(tmp_path / "run", write_solids(tmp_path / "lab"), assigned=True)

@@ -13,7 +13,7 @@ from viewer_pages import COLORS, HEIGHT, WIDTH, awaited, differing, painted, sli
 
 from beags_plugin.splat_io.ply import read_ply
 
-pytestmark = NEEDED
+pytestmark = [NEEDED, pytest.mark.slow("a browser draws a dozen views of a run by WebGL in software")]
 OUTPUTS = (
     "rgb", "depth", "normal", "accumulation", "class_map", "class_confidence", "boundary_error", "occupancy_violation",
     "mask_before", "mask_after",

@@ -18,7 +18,7 @@ from viewer_pages import HEIGHT, WIDTH, awaited, differing, free_port, painted, 
 from beags_plugin.objects.extract import extract_objects
 from beags_plugin.splat_io.ply import read_ply, write_ply
 
-pytestmark = NEEDED
+pytestmark = [NEEDED, pytest.mark.slow("a browser watches whole trainings")]
 STEPS = 60, 240  # of base and refinement
 
 

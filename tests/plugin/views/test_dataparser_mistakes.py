@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 from pathlib import Path
 
@@ -17,18 +16,6 @@ from PIL import Image
 
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.system.errors import UserError
-
-# --- paths and imports --------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("module", ["dataparser", "poses", "colmap_files", "cameras", "seed_points"])
-def test_no_import_of_a_data_manager(module):
-    import beags_plugin.plugin.views
-
-    source = (Path(beags_plugin.plugin.views.__path__[0]) / f"{module}.py").read_text()
-    imported = [node.module or "" for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ImportFrom)]
-    assert imported and not any("datamanager" in name for name in imported)
-
 
 # --- mistakes -----------------------------------------------------------------------------------------------------
 
