@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,10 +16,14 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.objects.shown import ShownScene
 from beags_plugin.surfaces.frames import Frame, bounding_box
 from beags_plugin.surfaces.item import Photo
+from beags_plugin.views.close_ups import fitted
+from beags_plugin.views.small_views import small_camera
+from beags_plugin.views.split_photos import resize_area
 
 _AROUND = 0.1  # A crop shows this share of the object's box beside it too.
 _MARGIN = 8  # pixels more
 _KEPT = 200_000_000  # bytes of an object's photos, masks and depths that stay in memory
+_SHARPER = 1.25  # least pixels along a side of a file's region, over those that were trained on, for which it is read
 
 Box = tuple[int, int, int, int]
 """Left, top, right and bottom, pixels; right and bottom are excluded."""
@@ -45,23 +50,69 @@ class _Kept:
 def photos_of(shown: ShownScene, class_id: int | None, part: Surfels, frame: Frame) -> Sequence[Photo]:
     """Return the photos of a class (None: of all of them) in ``frame``; images, masks and depth are read when used.
 
-    part: its Gaussians, in the run's frame. Photos are cropped to its box, and those that lack it left out.
+    part: its Gaussians, in the run's frame. Photos are cropped to its box, and those that lack it left out. Each has a
+    ``sharper`` one where its file has more pixels than were trained on; all of these take at most ``_KEPT`` bytes.
     """
-    kept, found = _Kept(), []
+    kept, found = _Kept(), list[tuple[int, Box]]()
     low, high = bounding_box(part)
     reach = _AROUND * (high - low)
     corners = torch.cartesian_prod(*torch.stack([low - reach, high + reach], dim=1).double())
     for view, camera in enumerate(shown.views.cameras):
         box = _box(camera, corners) if class_id is not None else (0, 0, camera.width, camera.height)
-        if box is None:
-            continue
-        left, top, right, bottom = box
-        there = slice(top, bottom), slice(left, right)
-        image = partial(kept.get, "image", view, partial(_image, shown, view, there))
-        own = partial(kept.get, "own", view, partial(_own, shown, view, class_id, there))
-        depth = partial(kept.get, "depth", view, partial(_depth, shown, view, frame.scale, there))
-        found.append(Photo(frame.camera(cropped(camera, left, top, right - left, bottom - top)), image, own, depth))
-    return found
+        if box is not None:
+            found.append((view, box))
+    sharp, most = _Kept(), _KEPT / 3 / max(len(found), 1)
+    return [_photo(shown, class_id, frame, view, box, kept, _sharper(shown, class_id, frame, view, box, sharp, most))
+            for view, box in found]  # fmt: skip
+
+
+def _photo(
+    shown: ShownScene, class_id: int | None, frame: Frame, view: int, box: Box, kept: _Kept, sharper: Photo | None
+) -> Photo:
+    """Return a part of a photo at the size that was trained on."""
+    left, top, right, bottom = box
+    there = slice(top, bottom), slice(left, right)
+    image = partial(kept.get, "image", view, partial(_image, shown, view, there))
+    own = partial(kept.get, "own", view, partial(_own, shown, view, class_id, there))
+    depth = partial(kept.get, "depth", view, partial(_depth, shown, view, frame.scale, there))
+    camera = frame.camera(cropped(shown.views.cameras[view], left, top, right - left, bottom - top))
+    return Photo(camera, image, own, depth, sharper=sharper)
+
+
+def _sharper(
+    shown: ShownScene, class_id: int | None, frame: Frame, view: int, box: Box, kept: _Kept, most: float
+) -> Photo | None:
+    """Return a part of a photo with the pixels of its file, at most ``most``; None where these are hardly more."""
+    if class_id is None:
+        return None
+    files, index = shown.manager.files["train"], shown.chosen[view]
+    camera, full = shown.views.cameras[view], files.full_camera(index)
+    across, down = full.width / camera.width, full.height / camera.height
+    left, right = math.floor(box[0] * across), min(full.width, math.ceil(box[2] * across))
+    top, bottom = math.floor(box[1] * down), min(full.height, math.ceil(box[3] * down))
+    size = fitted(right - left, bottom - top, most)
+    zoom = size[0] * across / (right - left)
+    if zoom < _SHARPER:
+        return None
+    # the pixel of the photo that was trained on at the middle of each finer one
+    columns = (((torch.arange(size[0]) + 0.5) * (right - left) / size[0] + left) / across).long()
+    rows = (((torch.arange(size[1]) + 0.5) * (bottom - top) / size[1] + top) / down).long()
+    there = rows.clamp(max=camera.height - 1)[:, None], columns.clamp(max=camera.width - 1)[None]
+
+    def read() -> Tensor:
+        region = files.full_regions(index, [(left, top, right, bottom)])[0]["image"]
+        return torch.from_numpy(resize_area(region.numpy(), *size))
+
+    def image() -> Tensor:
+        colors = kept.get("image", view, read).float() / 255.0
+        return colors if shown.exposures is None else shown.exposures.evened(colors, shown.names[view])
+
+    def own() -> Tensor:
+        mask = shown.views.labels[view].cpu()[there] == class_id
+        return mask if shown.exposures is None else mask & (kept.get("image", view, read) < 255).any(dim=2)
+
+    of_file = small_camera(cropped(full, left, top, right - left, bottom - top), size)
+    return Photo(frame.camera(of_file), image, own, partial(_depth, shown, view, frame.scale, there), math.ceil(zoom))
 
 
 def _box(camera: Camera, corners: Tensor) -> Box | None:
@@ -90,5 +141,5 @@ def _own(shown: ShownScene, view: int, class_id: int | None, there: tuple[slice,
     return own if shown.exposures is None else own & (shown.photos[view].image.cpu()[there] < 1.0).any(dim=2)
 
 
-def _depth(shown: ShownScene, view: int, scale: float, there: tuple[slice, slice]) -> Tensor:
+def _depth(shown: ShownScene, view: int, scale: float, there: tuple[Any, Any]) -> Tensor:
     return shown.views.depths[view].cpu()[there] / scale

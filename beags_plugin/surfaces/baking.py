@@ -93,17 +93,18 @@ def places_seen(places: Places, mesh: Mesh, caster: Any, photo: Photo) -> Shown:
     column, row = np.floor(xy[index]).astype(np.int64).T
     column, row = np.minimum(column, camera.width - 1), np.minimum(row, camera.height - 1)
     depth = photo.depth().numpy()[row, column]
-    index = index[well_inside(photo.own())[row, column] & ~((depth > 0) & (depth < (1.0 - TAU) * z[index]))]
+    index = index[well_inside(photo)[row, column] & ~((depth > 0) & (depth < (1.0 - TAU) * z[index]))]
     index = index[~_hidden(caster, mesh, places[index], camera.center.double().numpy())]
     light = linear_from_srgb(interpolated(photo.image(), xy[index]))
     pixels = cosine[index] * (camera.focal * places.spacing / z[index]) ** 2  # for the area of a place
     return index, light, np.minimum(pixels, 4.0) ** _SHARPEN
 
 
-def well_inside(mask: Tensor) -> np.ndarray:
-    """Return [H, W] bool, the pixels of a mask whose eight neighbours are in it: others mix with what is behind."""
-    around = torch.nn.functional.pad((~mask).float()[None, None], (1, 1, 1, 1))
-    return (torch.nn.functional.max_pool2d(around, 3, stride=1)[0, 0] == 0).numpy()
+def well_inside(photo: Photo) -> np.ndarray:
+    """Return [H, W] bool, the pixels of a photo's mask that are no edge: those mix with what is behind."""
+    edge = photo.edge
+    around = torch.nn.functional.pad((~photo.own()).float()[None, None], (edge, edge, edge, edge))
+    return (torch.nn.functional.max_pool2d(around, 2 * edge + 1, stride=1)[0, 0] == 0).numpy()
 
 
 def _hidden(caster: Any, mesh: Mesh, places: Places, center: np.ndarray) -> np.ndarray:

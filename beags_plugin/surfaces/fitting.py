@@ -25,7 +25,7 @@ from beags_plugin.surfaces.item import Photo
 from beags_plugin.surfaces.surface import rays_through, surface_of
 
 _RAYS = 0.25 * np.array([[1.0, 1.0], [3.0, 1.0], [1.0, 3.0], [3.0, 3.0]])  # in a pixel
-_MOST = 1_000_000  # pixels of all photos that are looked at; each takes about 400 bytes
+_MOST = 1_000_000  # pixels of all photos, each of which takes about 400 bytes; with more, the mean is sharp enough
 _HOLD = 0.2  # pull to the mean, in photos' pixels (chosen on tabletop 0 and room 0: notes/export.md)
 _STEPS = 20  # of the solver: it sharpens the longer the more, noise too
 
@@ -40,7 +40,8 @@ def fitted(
 ) -> np.ndarray:
     """Return a mesh's picture [S, S, 3] uint8 sRGB, fitted to photos from one that is their mean.
 
-    exposures: [V, 3] of the photos, which are divided by them. Texels that no photo shows stay as they are. progress:
+    exposures: [V, 3] of the photos, which are divided by them. A picture of more than a million pixels of photos stays
+    as it is. Texels that no photo shows stay as they are. progress:
     receives (done, total) photos.
     """
     from scipy.sparse import csr_array
@@ -50,10 +51,11 @@ def fitted(
     if not photos:
         return image
     caster, columns, shares, colors = surface_of(mesh), [], [], []
-    inside = [int(well_inside(photo.own()).sum()) for photo in photos]
-    part = min(1.0, _MOST / max(sum(inside), 1))
+    inside = [int(well_inside(photo).sum()) for photo in photos]
+    if sum(inside) > _MOST:  # some pixels alone would sharpen texels here and there
+        return image
     for done, (photo, exposure) in enumerate(zip(photos, exposures, strict=True), start=1):
-        found = _pixels(photo, atlas, mesh, caster, math.ceil(part * inside[done - 1]))
+        found = _pixels(photo, atlas, mesh, caster)
         columns.append(found[0])
         shares.append(found[1])
         colors.append(srgb_from_linear(linear_from_srgb(found[2]) / exposure))
@@ -80,18 +82,13 @@ def fitted(
     return new.reshape(image.shape)
 
 
-def _pixels(
-    photo: Photo, atlas: Atlas, mesh: Mesh, caster: Any, most: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pixels(photo: Photo, atlas: Atlas, mesh: Mesh, caster: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return which texels the pixels of a photo show, [M, 16] int32, their shares [M, 16] and the pixels [M, 3].
 
     Pixels well inside the item's mask, before which nothing of the scene stands, and that see the outside of the mesh,
-    not too flat, with all their rays; at most ``most`` of them, chosen at random. Texels count row by row.
+    not too flat, with all their rays. Texels count row by row.
     """
-    rows, cols = np.nonzero(well_inside(photo.own()))
-    if len(rows) > most:
-        chosen = np.sort(np.random.default_rng(0).choice(len(rows), most, replace=False))
-        rows, cols = rows[chosen], cols[chosen]
+    rows, cols = np.nonzero(well_inside(photo))
     xy = (np.stack([cols, rows], axis=1)[:, None] + _RAYS).reshape(-1, 2)
     rays, ways = rays_through(mesh, photo.camera, xy)
     hit = caster.cast_rays(rays)

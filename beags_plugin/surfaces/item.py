@@ -36,13 +36,17 @@ class Photo:
     """A training photo and what it shows of an item; what returns tensors may read files.
 
     camera: in the frame of the file. image: [H, W, 3] float32 in 0..1, sRGB. own: [H, W] bool, the item's mask.
-    depth: [H, W] of the whole scene, in the file's units along z, 0 where nothing is.
+    depth: [H, W] of the whole scene, in the file's units along z, 0 where nothing is. edge: pixels from the mask's
+    border within which it may not be right. sharper: the same part of the photo with more pixels, nearer to those of
+    its file; None where there are no more.
     """
 
     camera: Camera
     image: Callable[[], Tensor]
     own: Callable[[], Tensor]
     depth: Callable[[], Tensor]
+    edge: int = 1
+    sharper: Photo | None = None
 
 
 @dataclass(frozen=True)

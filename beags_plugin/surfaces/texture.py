@@ -18,7 +18,7 @@ from beags_plugin.surfaces.item import Photo
 from beags_plugin.surfaces.surface import area_vectors, vertex_normals
 from beags_plugin.system.progress import progress_bar
 
-LARGEST = 4096  # side of textures whose size is chosen here
+LARGEST = 2048  # side of textures whose size is chosen here
 _FINE = 1.5  # texels for a pixel of the photos along a side
 _NEAREST = 0.75  # share of the photos that may be farther away than the one that decides
 
@@ -39,6 +39,7 @@ class Texture:
 
 def textured(mesh: Mesh, photos: Sequence[Photo], size: int) -> Texture:
     """Return the texture of a mesh of at least one face; size: its side in texels, 0 for one that suits the photos."""
+    photos = [photo.sharper or photo for photo in photos]
     density = 0.0 if size else suitable_density(mesh, photos)
     atlas = unwrapped(mesh, LARGEST, density) if density else unwrapped(mesh, size or SMALLEST)
     at = texels(atlas)

@@ -140,11 +140,17 @@ def test_photos_that_look_away_do_not_coarsen_a_texture(box, photos):
     assert textured(box, behind, 0).atlas.size == 128
 
 
-def test_pixels_are_shared_out_where_there_are_too_many(box, photos, monkeypatch):
+def test_a_picture_of_more_pixels_than_can_be_fitted_stays_the_mean(box, photos, monkeypatch):
+    """Some of them alone would sharpen texels here and there."""
     atlas, mean = mean_picture(box, photos)
-    blank = [replace(photos[0], own=lambda: torch.zeros(160, 160, dtype=torch.bool))] * 30
     monkeypatch.setattr("beags_plugin.surfaces.fitting._MOST", 20_000)
-    few = fitted(mean, atlas, box, [*photos, *blank], np.ones((len(photos) + 30, 3)))
+    assert np.array_equal(fitted(mean, atlas, box, photos, np.ones((len(photos), 3))), mean)
+
+
+def test_textures_come_from_the_sharper_photos(box, photos):
+    coarse = [photo_of(box, camera_from(eye, 40), light=print_at, rays=3) for eye in EYES]
+    both = [replace(each, sharper=photo) for each, photo in zip(coarse, photos, strict=True)]
     other = camera_from((1.9, -0.4, 1.4))
-    assert error(box, atlas, few, other) < 0.9 * error(box, atlas, mean, other)
-    assert np.array_equal(few, fitted(mean, atlas, box, photos, np.ones((len(photos), 3))))
+    alone, sharp = (textured(box, given, 0) for given in (coarse, both))
+    assert sharp.atlas.size > alone.atlas.size
+    assert error(box, sharp.atlas, sharp.image, other) < 0.5 * error(box, alone.atlas, alone.image, other)
