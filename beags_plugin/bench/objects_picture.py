@@ -63,9 +63,10 @@ def _objects(
     scene: str, runs: Sequence[VariantTrial], outcomes: Mapping[str, Outcome], most: int
 ) -> list[list[np.ndarray]]:
     """Return the cells of the ``most`` largest objects of a scene, each with its photo first."""
+    from beags_plugin.core.select import select_class
     from beags_plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.pictures.cells import cell, crop, square_around
-    from beags_plugin.pictures.contact_sheet import alone, cut_out
+    from beags_plugin.pictures.object_cells import alone, over_board
     from beags_plugin.runs.read import read_run
 
     done = [trial for run in runs for trial in run.trials if outcomes[trial.digest].failed is None]
@@ -83,13 +84,17 @@ def _objects(
             found = None if trial is None else scenes.get(trial.digest)
             image = None
             if found is not None:
-                image = alone(found.surfels(), found.members, class_id, view.camera, first.rasterizer, first.settings)
+                part = select_class(found.surfels(), found.members, class_id)[0]
+                image = alone(part, view.camera, first.settings, first.rasterizer)
             drawn.append(image)
         shape = next((image.shape[:2] for image in drawn if image is not None), truth.shape)
         window = square_around(truth if truth.shape == shape else np.ones(shape, dtype=bool))
         photo = (view.image.clamp(0, 1) * 255).byte().cpu().numpy()
         white = np.full((_SIDE, _SIDE, 3), 255, np.uint8)
-        pictures = [crop(photo, window), *(white if image is None else cut_out(image, window) for image in drawn)]
+        pictures = [
+            crop(photo, window),
+            *(white if image is None else over_board(crop(image, window), _SIDE) for image in drawn),
+        ]
         captions = captioned([f"{scene}: {name}", *(run.variant.name for run in runs)])
         rows.append([cell(image, (_SIDE, _SIDE), text) for image, text in zip(pictures, captions, strict=True)])
     return rows

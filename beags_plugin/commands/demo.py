@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -26,6 +26,9 @@ from beags_plugin.system.whole_files import write_text_atomically
 
 if TYPE_CHECKING:
     from beags_plugin.commands.scene_setup import MadeScene
+    from beags_plugin.core.surfels import Surfels
+    from beags_plugin.objects.evaluate import EvaluatedRun
+    from beags_plugin.objects.extract import Extracted
     from beags_plugin.plugin.options.model_options import BeagsModelConfig
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
@@ -34,7 +37,6 @@ STARTED = "started"  # in there, holds the request until the training ends
 PRESET, PRESET_OF_PHOTOS = "beags-tiny", "beags-fast"
 AGREE = ("--pipeline.model.prepare.agree", "True")  # a network's masks err in many views alike
 QUIET = ("--logging.steps-per-log", "50", "--logging.local-writer.max-log-size", "0")  # where no table can be redrawn
-SHEET_VIEWS = 3  # held-out views in the picture
 
 
 def run_demo(
@@ -215,7 +217,8 @@ def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene
     from beags_plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.objects.extract import extract_objects
     from beags_plugin.pictures.cells import write_picture
-    from beags_plugin.pictures.contact_sheet import contact_sheet, draw_rows, novel_camera
+    from beags_plugin.pictures.contact_sheet import contact_sheet
+    from beags_plugin.pictures.object_cells import Drawing
 
     with timed(seconds, "evaluation"), progress_bar("Evaluating") as progress:
         evaluated = EvaluatedRun(run / "config.yml")
@@ -224,15 +227,13 @@ def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene
         extracted = extract_objects(run / "config.yml", progress=progress)
     picture = output / "contact_sheet.png"
     with timed(seconds, "picture"), progress_bar("Making the picture") as progress:
-        views, classes = evaluated.views, evaluated.classes
-        shown = views[:: max(1, len(views) // SHEET_VIEWS)][:SHEET_VIEWS]
-        objects = [index for index in classes if index != 0]
-        base, refined = evaluated.stages["before"], evaluated.stages["after"]
-        scenes = ((base.surfels(), base.members), (refined.surfels(), refined.members))
-        drawing = (evaluated.rasterizer, evaluated.settings)
-        scenery = {"novel": novel_camera(views), "background": views.background, "progress": progress}
-        rows = draw_rows(shown, *scenes, objects, *drawing, **scenery)
-        write_picture(picture, contact_sheet(rows, classes))
+        views = evaluated.views
+        refined, drawing = evaluated.stages["after"], Drawing(evaluated.rasterizer, evaluated.settings)
+        sheet = contact_sheet(
+            views, views.cameras("train"), refined.surfels(), _alone(evaluated, extracted), evaluated.classes, drawing,
+            background=views.background, progress=progress,
+        )  # fmt: skip
+        write_picture(picture, sheet)
     training = json.loads((run / "training.json").read_text())
     made = {name: seconds.pop(name) for name in ("sample", "poses and masks") if name in seconds}
     stages = {**made, **training["seconds"], **seconds}
@@ -250,6 +251,19 @@ def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene
     CONSOLE.print(f"look:    beags view {quoted(run)}")
     for line in sure.lines:
         CONSOLE.print(line)
+
+
+def _alone(run: EvaluatedRun, written: Sequence[Extracted]) -> dict[int, dict[str, Surfels]]:
+    """Return object id to its Gaussians with assignment alone, and as they were written."""
+    from beags_plugin.core.select import select_class
+    from beags_plugin.runs.read import read_run
+
+    base = run.stages["before"]
+    objects = {each: select_class(base.surfels(), base.members, each)[0] for each in run.classes if each != 0}
+    found = {class_id: {"before": surfels} for class_id, surfels in objects.items()}
+    for scene in (read_run(each.config) for each in written):
+        found[int(scene.members.class_ids[0])]["after"] = scene.surfels()
+    return found
 
 
 @contextmanager

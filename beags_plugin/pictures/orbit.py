@@ -15,6 +15,7 @@ from beags_plugin.rasterizers.interface import RasterSettings
 
 _FIELD_OF_VIEW = math.radians(35.0)
 _MARGIN = 1.06  # around what the widest picture of the turn shows of the box: discs reach beyond it
+_STEP = 5  # degrees between the sides of which one is chosen
 _NEAR, _FAR = 0.02, 100.0  # in units of the distance to the centre
 
 
@@ -67,22 +68,56 @@ def orbit(stand: OrbitFrame, count: int, pixels: int, elevation: float = 20.0, t
     count: of cameras. pixels: side of the square pictures. elevation: degrees above the horizon. turn: degrees; a whole
     turn comes back to the start, less swings to and fro about the front. The cameras are float32.
     """
-    right, forward = _horizon(stand)
-    height = math.radians(elevation)
     cameras = []
     for index in range(count):
         share = index / count
-        angle = math.radians(turn * share if turn >= 360.0 else 0.5 * turn * math.sin(2 * math.pi * share))
-        level = math.sin(angle) * right - math.cos(angle) * forward  # towards the camera
-        away = math.cos(height) * level + math.sin(height) * stand.up
-        cameras.append(_look_at(stand.center + stand.distance * away, stand, pixels))
+        azimuth = turn * share if turn >= 360.0 else 0.5 * turn * math.sin(2 * math.pi * share)
+        cameras.append(_look_at(stand.center + stand.distance * side(stand, azimuth, elevation), stand, pixels))
     reach = max(_reach(camera, stand.corners) for camera in cameras)
     return [_zoomed(camera, 1.0 / (_MARGIN * max(reach, 1e-3))) for camera in cameras]
+
+
+def side(stand: OrbitFrame, azimuth: float, elevation: float) -> Tensor:
+    """Return a side of the object: [3] float64, unit, from the centre on.
+
+    azimuth: degrees about the up axis, from the front on. elevation: degrees above the horizon.
+    """
+    right, forward = _horizon(stand)
+    angle, height = math.radians(azimuth), math.radians(elevation)
+    level = math.sin(angle) * right - math.cos(angle) * forward
+    return math.cos(height) * level + math.sin(height) * stand.up
+
+
+def least_shown(stand: OrbitFrame, cameras: Sequence[Camera], elevation: float) -> float:
+    """Return the azimuth, whole degrees, of the side that no camera looks at the centre from, nor from near it.
+
+    cameras: of the photos; those that do not have the centre in their picture do not count. 180 without any.
+    """
+    shown = [camera for camera in cameras if shows(camera, stand.center)]
+    if not shown:
+        return 180.0
+    aways = torch.stack([camera.center for camera in shown]).double() - stand.center
+    sides = torch.stack([side(stand, azimuth, elevation) for azimuth in range(0, 360, _STEP)])
+    nearest = (sides @ torch.nn.functional.normalize(aways, dim=1).T).amax(dim=1)
+    return float(_STEP * int(nearest.argmin()))
+
+
+def view_from(stand: OrbitFrame, away: Tensor, pixels: int, room: float = 1.0) -> Camera:
+    """Return a square view of the centre from the side ``away`` [3], of which the box fills ``1 / room``."""
+    camera = _look_at(stand.center + stand.distance * away, stand, pixels)
+    return _zoomed(camera, 1.0 / (room * _MARGIN * max(_reach(camera, stand.corners), 1e-3)))
 
 
 def orbit_settings(stand: OrbitFrame) -> RasterSettings:
     """Return the depth range of the orbit's cameras, for colours only."""
     return RasterSettings(_NEAR * stand.distance, _FAR * stand.distance, geometry=False, distortion=False)
+
+
+def shows(camera: Camera, point: Tensor) -> bool:
+    """Return whether a point [3] lies in a camera's picture."""
+    xy, z = project(point[None], camera)
+    (x, y), inside = xy[0].tolist(), float(z[0]) > 0
+    return inside and 0 <= x < camera.width and 0 <= y < camera.height
 
 
 def _reach(camera: Camera, points: Tensor) -> float:

@@ -1,4 +1,4 @@
-"""Figures of a run, their table, JSON and contact sheet, on scenes of a stand-in rasterizer whose masks are known."""
+"""Figures of a run, their table and JSON, on scenes of a stand-in rasterizer whose masks are known."""
 
 from __future__ import annotations
 
@@ -7,16 +7,12 @@ import json
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from known_masks import BOX, CLASSES, CUP, FLOOR, SETTINGS, SIZE, Squares, camera, scene, square_mask, truth
-from PIL import Image
 from rich.console import Console
 
-from beags_plugin.core.cameras import Camera
 from beags_plugin.core.membership import Membership
-from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import METRICS, MaskMetrics
 from beags_plugin.evaluation.protocol import Protocol
@@ -25,16 +21,7 @@ from beags_plugin.evaluation.report import RunMetrics
 from beags_plugin.evaluation.run_metrics import evaluate_scene
 from beags_plugin.evaluation.table import render_run, summary_json
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.pictures.cells import write_picture
-from beags_plugin.pictures.contact_sheet import (
-    SheetRow,
-    contact_sheet,
-    draw_rows,
-    interpolate_cameras,
-    novel_camera,
-)
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
-from beags_plugin.system.errors import UserError
 
 STRAY = (20.0, 20.0, 2.0)
 IDS = torch.tensor([1, 2, 0], dtype=torch.int32)  # cup, box, floor
@@ -205,69 +192,3 @@ def test_the_table_shows_both_stages():
         "Protocol: extracted masks against whole occlusion-free",
     ):
         assert part in out.getvalue()
-
-
-def test_half_way_between_two_cameras():
-    quat = torch.tensor([math.cos(0.3), 0, math.sin(0.3), 0])  # a turn of 0.6 about y
-    viewmat = torch.eye(4)
-    viewmat[:3, :3] = rotation_from_quat(quat)
-    viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor([2.0, 0, 0])
-    turned = Camera(viewmat, camera().K, SIZE, SIZE)
-    middle = interpolate_cameras(camera(), turned, 0.5)
-    assert torch.allclose(middle.center, torch.tensor([1.0, 0, 0]), atol=1e-6)
-    expected = rotation_from_quat(torch.tensor([math.cos(0.15), 0, math.sin(0.15), 0]))
-    assert torch.allclose(middle.rotation, expected, atol=1e-6)
-    for fraction, end in ((0.0, camera()), (1.0, turned)):
-        assert torch.allclose(interpolate_cameras(camera(), turned, fraction).viewmat, end.viewmat, atol=1e-6)
-
-
-def test_the_novel_view_lies_towards_the_nearest_one():
-    views = [EvalView(camera(shift), None) for shift in (0.0, 5.0, -1.0)]
-    novel = novel_camera(views)
-    assert novel is not None and novel_camera(views[:1]) is None
-    assert torch.allclose(novel.center, 0.5 * (views[0].camera.center + views[2].camera.center), atol=1e-6)
-
-
-def test_the_sheet_shows_objects_before_and_after(tmp_path):
-    scenes = [(scene([CUP, BOX, FLOOR], grey=grey), Membership(IDS)) for grey in (0.3, 0.6)]
-    views = [EvalView(camera(s), torch.rand(SIZE, SIZE, 3), truth(), name=f"view {s}") for s in (0.0, 1.0)]
-    counts: list[tuple[int, int]] = []
-    options = {"novel": novel_camera(views), "progress": lambda *steps: counts.append(steps)}
-    rows = draw_rows(views, *scenes, [1, 2], Squares(), SETTINGS, **options)
-    assert counts == [(1, 3), (2, 3), (3, 3)]
-    assert [row.name for row in rows] == ["view 0.0", "view 1.0", "novel view"]
-    assert np.array_equal(rows[0].after[1][..., 3] == 255, square_mask(*CUP).numpy())
-    assert (rows[0].before[1][12, 8, :3] == 76).all() and (rows[0].after[1][12, 8, :3] == 153).all()
-    write_picture(tmp_path / "out" / "sheet.png", contact_sheet(rows, CLASSES))
-    with Image.open(tmp_path / "out" / "sheet.png") as picture:
-        sheet = np.asarray(picture)
-    assert np.array_equal(sheet, contact_sheet(rows, CLASSES))
-    # three rows, each of seven cells: photo, mask, render, and two objects before and after
-    assert sheet.shape[0] > 3 * 220 and sheet.shape[1] > 7 * 220
-    assert all((sheet == grey).all(axis=-1).sum() > 1000 for grey in (76, 153))
-
-
-def test_a_sheet_of_many_objects_is_no_wider_than_a_screen():
-    cell = np.zeros((SIZE, SIZE, 4), dtype=np.uint8)
-    shown = {index: np.where(np.arange(4) < 3, 30 * index, 255) + cell for index in range(1, 8)}
-    shown = {index: image.astype(np.uint8) for index, image in shown.items()}
-    row = SheetRow("v", None, np.zeros((SIZE, SIZE), int), np.zeros((SIZE, SIZE, 3), np.uint8), shown, shown)
-    sheet = contact_sheet([row], {index: str(index) for index in shown})
-    assert sheet.shape[1] <= 1920 and sheet.shape[0] == 3 * (220 + 18 + 4)  # 2, then 4, then 1 object
-    for index in shown:
-        assert (sheet == 30 * index).all(-1).sum() > 220 * 220  # of both stages, with the crop's margin
-
-
-def test_a_sheet_survives_absent_parts_but_not_a_place_that_cannot_be_written(tmp_path):
-    blank = np.zeros((SIZE, 2 * SIZE, 3), dtype=np.uint8)
-    nothing = {1: np.zeros((SIZE, 2 * SIZE, 4), dtype=np.uint8)}
-    row = SheetRow("an → name", None, None, blank, nothing, nothing)
-    assert contact_sheet([row], {1: "Tasse ☕"}).dtype == np.uint8
-    masked = replace(row, labels=np.zeros((SIZE, 2 * SIZE), int))
-    widths = [contact_sheet(rows, {}).shape[1] for rows in ([row], [row, masked])]
-    assert widths[1] - widths[0] > 440  # a cell of masks in every row, where there is one
-    with pytest.raises(ValueError, match="at least one row"):
-        contact_sheet([], {})
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="cannot be written"):
-        write_picture(tmp_path / "file" / "sheet.png", np.zeros((4, 4, 3), np.uint8))

@@ -1,0 +1,186 @@
+"""One object of a run alone, before and after refinement: as held-out photos show it, and where they do not look."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from beags_plugin.core.cameras import Camera, cropped
+from beags_plugin.core.lifting import project
+from beags_plugin.core.surfels import Surfels
+from beags_plugin.evaluation.records import EvalView
+from beags_plugin.evaluation.truths import extracted_truth
+from beags_plugin.labels.class_ids import resize_nearest
+from beags_plugin.pictures.cells import GAP, Square, below, cell, checkerboard, square_around, wrapped
+from beags_plugin.pictures.orbit import OrbitFrame, least_shown, orbit_frame, orbit_settings, shows, side, view_from
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+from beags_plugin.rasterizers.rendering import surfel_inputs
+from beags_plugin.surfaces.frames import bounding_box
+
+COLUMNS = 6  # cells of a line
+SMALLEST, LARGEST = 150, 480  # pixels: sides of a cell, where the object has fewer or more in the photos
+FAINT = 0.1  # alpha from which a stray splat widens the crop
+_VIEWS = 2  # each with its photo, before and after: they fill a line
+_PROBE, _ROOM = 160, 3.0  # pixels, and sides of the object's box, in which stray splats are looked for
+_BELOW, _LEVEL = -30.0, 10.0  # degrees above the horizon
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What renders a sheet; settings: of the scene, for colours only."""
+
+    rasterizer: Rasterizer
+    settings: RasterSettings
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """A square picture of an object. camera: of as many pixels as the photo's file has there. photo: [h, w, 3] uint8,
+    or None where no photo looks."""
+
+    caption: str
+    camera: Camera
+    settings: RasterSettings
+    photo: np.ndarray | None = None
+
+
+def object_cells(
+    class_id: int,
+    name: str,
+    stages: Mapping[str, Surfels],
+    views: Sequence[EvalView],
+    cameras: Sequence[Camera],
+    drawing: Drawing,
+) -> np.ndarray:
+    """Return [H, W, 3] uint8: lines of ``COLUMNS`` cells, at the resolution that the photos' files have of the object.
+
+    The first has two held-out photos from sides far apart, and the object there at each stage; the second two sides
+    from below the horizon, and the one that photos show least. Crops hold all of the object that is drawn, strays too.
+
+    stages: caption to the object's Gaussians alone; the last one that has any says where it is. views: held-out ones;
+    those that do not show the object are left out. cameras: of the training photos.
+    """
+    place = next(each for each in reversed(list(stages.values())) if len(each))
+    stand = orbit_frame(*bounding_box(place), cameras)
+    shots = [_in_view(views[each], class_id, stages, drawing) for each in views_of(stand, views)]
+    pixels = min(max((shot.camera.width for shot in shots), default=LARGEST), LARGEST)
+    back = least_shown(stand, cameras, _LEVEL)
+    for caption, away in (
+        ("from below", side(stand, 0.0, _BELOW)),
+        ("from below, behind", side(stand, 180.0, _BELOW)),
+        ("least shown side", side(stand, back, _LEVEL)),
+    ):
+        shots.append(_from_side(stand, caption, away, pixels, stages, drawing))
+    size = max(pixels, SMALLEST)
+    groups = []
+    for shot in shots:
+        photo = [] if shot.photo is None else [cell(shot.photo, (size, size), f"{name}, {shot.caption}")]
+        renders = []
+        for stage, surfels in stages.items():
+            image = alone(surfels, _sized(shot.camera, pixels), shot.settings, drawing.rasterizer)
+            caption = stage if photo else f"{shot.caption}: {stage}"
+            renders.append(cell(over_board(image, size), (size, size), caption))
+        groups.append([*photo, *renders])
+    return below(wrapped(groups, COLUMNS * (size + GAP)))
+
+
+def views_of(stand: OrbitFrame, views: Sequence[EvalView]) -> list[int]:
+    """Return the places of at most two views of an object, whole in the picture if it is in any, from sides far apart.
+
+    The first is the one that shows it largest.
+    """
+    whole: dict[int, tuple[int, float]] = {}
+    for index, view in enumerate(views):
+        if shows(view.camera, stand.center):
+            corners = sum(shows(view.camera, corner) for corner in stand.corners)
+            _, z = project(stand.center[None], view.camera)
+            whole[index] = corners, view.camera.focal / (float(z[0]) * view.camera.width)
+    if not whole:
+        return []
+    most = max(corners for corners, _ in whole.values())
+    best = [index for index, (corners, _) in whole.items() if corners == most]
+    chosen = [max(best, key=lambda index: whole[index][1])]
+    aways = {i: torch.nn.functional.normalize(views[i].camera.center.double() - stand.center, dim=0) for i in whole}
+    rest = [index for index in (best if len(best) >= _VIEWS else whole) if index not in chosen]
+    return [*chosen, *sorted(rest, key=lambda index: float(aways[index] @ aways[chosen[0]]))[: _VIEWS - 1]]
+
+
+def alone(surfels: Surfels, camera: Camera, settings: RasterSettings, rasterizer: Rasterizer) -> np.ndarray:
+    """Return [H, W, 4] uint8: Gaussians rendered alone, straight alpha."""
+    if len(surfels) == 0:
+        return np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
+    settings = replace(settings, geometry=False, distortion=False)
+    with torch.no_grad():
+        render = rasterizer.rasterize(
+            surfel_inputs(surfels.detach(), camera), camera, settings, surfels.means.new_zeros(3)
+        )
+    alpha = render.alpha[..., None]
+    # Under 1/255 alpha is written as 0, so the bound only keeps the quotient finite.
+    return as_bytes(torch.cat([render.color / alpha.clamp(min=1 / 255), alpha], dim=-1))
+
+
+def over_board(image: np.ndarray, size: int) -> np.ndarray:
+    """Return [size, size, 3] uint8: a square [H, H, 4] image, straight alpha, enlarged over a checkerboard."""
+    large = np.stack([resize_nearest(image[..., i], size, size) for i in range(4)], axis=-1).astype(np.float64)
+    board = checkerboard(size, size, 8)[..., None]
+    alpha = large[..., 3:] / 255
+    return (large[..., :3] * alpha + board * (1 - alpha)).round().astype(np.uint8)
+
+
+def as_bytes(image: Tensor) -> np.ndarray:
+    """Return a float image in 0..1 as uint8."""
+    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+
+
+def _in_view(view: EvalView, class_id: int, stages: Mapping[str, Surfels], drawing: Drawing) -> _Shot:
+    """Return the square of a view, at the size of its file, that holds the object at all stages and in truth."""
+    truth, size = extracted_truth(view, class_id), (view.camera.height, view.camera.width)
+    shown = np.zeros(size, dtype=bool) if truth is None else resize_nearest(truth.mask.cpu().numpy(), *size)
+    window = _shown(shown, view.camera, drawing.settings, stages, drawing.rasterizer)
+    full = view.camera if view.full is None else view.full.camera
+    ratio = full.width / view.camera.width
+    top, left, length = (round(ratio * each) for each in window)
+    camera = cropped(full, left, top, length, length)
+    return _Shot(view.name, camera, drawing.settings, _photo(view, full, (top, left, length)))
+
+
+def _shown(
+    shown: np.ndarray, camera: Camera, settings: RasterSettings, stages: Mapping[str, Surfels], rasterizer: Rasterizer
+) -> Square:
+    """Return the square around the pixels of ``shown`` [H, W] bool and all that the object covers at any stage."""
+    for surfels in stages.values():
+        shown = shown | (alone(surfels, camera, settings, rasterizer)[..., 3] > 255 * FAINT)
+    return square_around(shown)
+
+
+def _photo(view: EvalView, full: Camera, window: Square) -> np.ndarray | None:
+    """Return [length, length, 3] uint8: the window of the photo's file; white outside of it."""
+    top, left, length = window
+    x0, y0, x1, y1 = max(left, 0), max(top, 0), min(left + length, full.width), min(top + length, full.height)
+    if view.image is None or x0 >= x1 or y0 >= y1:
+        return None
+    part = view.image[y0:y1, x0:x1] if view.full is None else view.full.region((x0, y0, x1, y1))[1]
+    picture = np.full((length, length, 3), 255, dtype=np.uint8)
+    picture[y0 - top : y1 - top, x0 - left : x1 - left] = as_bytes(part)
+    return picture
+
+
+def _from_side(
+    stand: OrbitFrame, caption: str, away: Tensor, pixels: int, stages: Mapping[str, Surfels], drawing: Drawing
+) -> _Shot:
+    """Return the square that holds all that the object covers from a side, strays around it too."""
+    probe, settings = view_from(stand, away, _PROBE, _ROOM), orbit_settings(stand)
+    top, left, length = _shown(np.zeros((_PROBE, _PROBE), dtype=bool), probe, settings, stages, drawing.rasterizer)
+    return _Shot(caption, _sized(cropped(probe, left, top, length, length), pixels), settings)
+
+
+def _sized(camera: Camera, pixels: int) -> Camera:
+    """Return a square camera, of the same picture in at most so many pixels."""
+    if camera.width == pixels:
+        return camera
+    factor = camera.K.new_tensor([[pixels / camera.width], [pixels / camera.width], [1.0]])
+    return Camera(camera.viewmat, camera.K * factor, pixels, pixels)
