@@ -262,7 +262,8 @@ def _alone(run: EvaluatedRun, written: Sequence[Extracted]) -> dict[int, dict[st
     objects = {each: select_class(base.surfels(), base.members, each)[0] for each in run.classes if each != 0}
     found = {class_id: {"before": surfels} for class_id, surfels in objects.items()}
     for scene in (read_run(each.config) for each in written):
-        found[int(scene.members.class_ids[0])]["after"] = scene.surfels()
+        if len(scene.members):
+            found[int(scene.members.class_ids[0])]["after"] = scene.surfels()
     return found
 
 

@@ -29,10 +29,10 @@ def check_source() -> None:
     fetch_weights()
 
 
-def made_masks(scene: Path, folder: Path) -> Path | None:
+def made_masks(scene: Path, folder: Path, name: str) -> Path | None:
     """Make the masks of a scene in ``folder``; return it, or None if it is the scene's.
 
-    scene: or a folder of photos, without poses. What an earlier call made is taken as it is.
+    scene: or a folder of photos, without poses. name: of the object. What an earlier call made is taken as it is.
     """
     from beags_plugin.masks.sources.salient import SalientSource
     from beags_plugin.objects.make_masks import make_masks
@@ -53,7 +53,7 @@ def made_masks(scene: Path, folder: Path) -> Path | None:
         )
         folder.mkdir(parents=True, exist_ok=True)
         write_text_atomically(json.dumps({"masks": UNFINISHED}), folder / MADE)
-        for line in make_masks(config, SalientSource(), output=folder, overwrite=True):
+        for line in make_masks(config, SalientSource(name=name), output=folder, overwrite=True):
             CONSOLE.print(line)
         write_text_atomically(json.dumps({"photos": photos, "masks": folder_digest(masks)}), folder / MADE)
     CONSOLE.print(f"Look at {folder / 'made.png'}. Masks in {masks} that you mend are taken by the next demo.")

@@ -70,6 +70,12 @@ def name_of(data: Path) -> str:
     return folder.stem if data.is_file() else folder.parent.name if folder.name == "images" else folder.name
 
 
+def object_name(data: Path) -> str:
+    """Return what the one object of photos is called: as their folder or video, where that can name a class."""
+    name = name_of(data).strip()
+    return name if name and name.isprintable() and name != "background" else "object"
+
+
 def made_scene(data: Path, output: Path) -> MadeScene:
     """Return the scene in ``data``, or one made below ``output`` of photos without poses, or without masks.
 
@@ -82,7 +88,7 @@ def made_scene(data: Path, output: Path) -> MadeScene:
         if _has_masks(data):
             return MadeScene(data)
         check_source()
-        return MadeScene(data, made_masks(data, output / "made"))
+        return MadeScene(data, made_masks(data, output / "made", object_name(data)))
     found = [] if is_video(data) else find_photos(data)  # says what is wrong with them before anything is fetched
     given = data if any((data / "masks").rglob("*.png")) else None
     scene = output / "scene"
@@ -97,7 +103,7 @@ def made_scene(data: Path, output: Path) -> MadeScene:
         _print_poses(data, scene)
     except NothingFits as error:
         CONSOLE.print("The photos as a whole give no poses, so poses of the objects alone are tried.")
-        if (own := _scene_of_objects(scene, output / "turned", given, room=False)) is None:
+        if (own := _scene_of_objects(scene, output / "turned", given, object_name(data), room=False)) is None:
             raise error
     if not (scene / MADE_OF).exists():
         write_text_atomically(json.dumps(str(data.resolve())), scene / MADE_OF)
@@ -105,13 +111,13 @@ def made_scene(data: Path, output: Path) -> MadeScene:
         return own
     if given is not None and (scene / MADE).exists():
         (scene / "classes.json").unlink(missing_ok=True)  # of masks that were made when none were given
-    labels = given or made_masks(scene, scene)
+    labels = given or made_masks(scene, scene, object_name(data))
     if objects_seem_turned(scene / MODEL, (labels or scene) / "masks"):
         CONSOLE.print(
             "The poses explain few of the objects' features, as if the objects had turned before a room that stands: "
             "poses of the objects alone are tried."
         )
-        own = _scene_of_objects(scene, output / "turned", given, room=True)
+        own = _scene_of_objects(scene, output / "turned", given, object_name(data), room=True)
     return own or MadeScene(scene, labels)
 
 
@@ -120,16 +126,17 @@ def _print_poses(data: Path, scene: Path, masks: Path | None = None) -> None:
         CONSOLE.print(line)
 
 
-def _scene_of_objects(scene: Path, folder: Path, given: Path | None, room: bool) -> MadeScene | None:
+def _scene_of_objects(scene: Path, folder: Path, given: Path | None, name: str, room: bool) -> MadeScene | None:
     """Make a scene in ``folder`` with poses from the objects' features alone.
 
-    scene: with the photos. given: the folder that holds the user's masks/. room: whether ``scene`` has poses of the
-    whole photos. Returns None, and says why, where the objects show too little for poses, or moved as the room did.
+    scene: with the photos. given: the folder that holds the user's masks/. name: of the object. room: whether ``scene``
+    has poses of the whole photos. Returns None, and says why, where the objects show too little for poses, or moved as
+    the room did.
     """
     labels, photos = given or folder / "labels", scene / "images"
     try:
         if given is None:
-            _all_masks(photos, labels, scene / "masks" if room else None)
+            _all_masks(photos, labels, name, scene / "masks" if room else None)
         _print_poses(photos, folder, labels / "masks")
     except (NothingFits, NothingFound) as error:
         CONSOLE.print(f"There are no poses of the objects alone: {error}")
@@ -147,9 +154,9 @@ def _scene_of_objects(scene: Path, folder: Path, given: Path | None, room: bool)
     return MadeScene(folder, labels, turned=True)
 
 
-def _all_masks(photos: Path, labels: Path, mended: Path | None) -> None:
+def _all_masks(photos: Path, labels: Path, name: str, mended: Path | None) -> None:
     """Make masks of all photos, of held-out ones too, as their poses need them; those in ``mended`` go before."""
-    made_masks(photos, labels)
+    made_masks(photos, labels, name)
     for mask in sorted(mended.glob("*.png")) if mended is not None else ():
         same = labels / "masks" / mask.name
         if not same.exists() or same.read_bytes() != mask.read_bytes():

@@ -15,7 +15,7 @@ from run_folders import write_scene
 from test_documented_commands import training_config
 from weights import fetch
 
-from beags_plugin.commands import demo, made_scene
+from beags_plugin.commands import demo, scene_setup
 from beags_plugin.commands.scene_setup import MadeScene
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.masks.sources.salient import SalientSource
@@ -83,7 +83,7 @@ def test_photos_alone_are_trained_on_with_poses_and_masks_once(photos, tmp_path,
     parser = config.data_config.dataparser
     parser.data = config.data  # as ns-train does
     metadata = parser.setup().get_dataparser_outputs("train").metadata
-    assert metadata["classes"] == {0: "background", 1: "object"}
+    assert metadata["classes"] == {0: "background", 1: "walk"}
     for path in metadata["mask_filenames"]:
         mask = read_id_mask(path) == 1
         assert mask[110:130, 150:170].all() and mask.mean() < 0.2  # the thing takes 4 %
@@ -98,6 +98,23 @@ def test_photos_alone_are_trained_on_with_poses_and_masks_once(photos, tmp_path,
     assert len(trainings) == 1
     demo.run_demo(photos, tmp_path / "out", None, None, 0, True)
     assert len(trainings) == 2
+
+
+@pytest.mark.parametrize(
+    ("path", "name"),
+    [
+        ("bear", "bear"),
+        ("bear/images", "bear"),
+        ("my walk.mp4", "my walk"),
+        ("background", "object"),
+        ("a\tb", "object"),
+    ],
+)
+def test_the_object_is_called_as_the_photos_are(tmp_path, path, name):
+    place = tmp_path / path
+    place.parent.mkdir(exist_ok=True)
+    place.touch() if place.suffix else place.mkdir()
+    assert scene_setup.object_name(place) == name
 
 
 @pytest.fixture
@@ -128,7 +145,7 @@ def test_masks_are_made_anew_for_other_photos_unless_they_were_mended(posed, tmp
     def made_of(row: int) -> bool:
         """Move the thing in a photo; return whether its mask is there."""
         write_image(photo, cv2.circle(np.full((60, 100, 3), 90, np.uint8), (50, row), 14, (230, 20, 30), -1))
-        assert made_scene.made_scene(posed, tmp_path / "out") == MadeScene(posed, tmp_path / "out/made")
+        assert scene_setup.made_scene(posed, tmp_path / "out") == MadeScene(posed, tmp_path / "out/made")
         return bool(read_id_mask(mask)[row, 50])
 
     assert made_of(20) and made_of(40)
@@ -142,7 +159,7 @@ def test_a_network_that_finds_nothing_is_a_user_error(posed, tmp_path):
     for photo in (posed / "images").iterdir():
         write_image(photo, np.full((60, 100, 3), 90, np.uint8))
     with pytest.raises(UserError, match="found no object in any view"):
-        made_scene.made_scene(posed, tmp_path / "out")
+        scene_setup.made_scene(posed, tmp_path / "out")
     assert not any((tmp_path / "out/made").rglob("*.png"))
 
 
@@ -154,7 +171,7 @@ def test_masks_of_photos_without_poses_are_taken(photos, tmp_path, monkeypatch):
     for photo in (scene / "images").iterdir():
         write_image(scene / "masks" / photo.name, np.ones((240, 320), np.uint8))
     monkeypatch.setattr(SalientSource, "unavailable", classmethod(lambda _: "not needed."))
-    made = made_scene.made_scene(scene, tmp_path / "out")
+    made = scene_setup.made_scene(scene, tmp_path / "out")
     assert made == MadeScene(tmp_path / "out/scene", scene)
     assert made.options() == ["--masks-path", str(scene / "masks")]
 
@@ -167,7 +184,7 @@ def test_masks_of_photos_that_lie_on_their_side_are_refused_before_poses_are_com
     for photo in list(photos.iterdir()):
         write_image(photos / "masks" / photo.name, np.ones((240, 320), np.uint8))
     with pytest.raises(UserError, match=r"v03\.png is stored on its side"):
-        made_scene.made_scene(photos, tmp_path / "out")
+        scene_setup.made_scene(photos, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -197,21 +214,21 @@ def test_other_photos_and_incomplete_scenes_are_refused(photos, tmp_path):
     (tmp_path / "out/scene").mkdir(parents=True)
     (tmp_path / "out/scene/made_of.json").write_text('"/elsewhere/walk.mp4"')
     with pytest.raises(UserError, match="was made of /elsewhere/walk.mp4: give another --output"):
-        made_scene.made_scene(photos, tmp_path / "out")
+        scene_setup.made_scene(photos, tmp_path / "out")
     (photos / "transforms_train.json").write_text("{}")  # of another program
     with pytest.raises(UserError, match=r"holds neither transforms\.json"):
-        made_scene.made_scene(photos, tmp_path / "other")
+        scene_setup.made_scene(photos, tmp_path / "other")
 
 
 def test_masks_that_were_interrupted_are_made_anew(posed, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("beags_plugin.objects.make_masks.check", lambda *_, **__: 1 / 0)
         with pytest.raises(ZeroDivisionError):
-            made_scene.made_scene(posed, tmp_path / "out")
+            scene_setup.made_scene(posed, tmp_path / "out")
     mask = tmp_path / "out/made/masks/v01.png"
     assert mask.exists()
     mask.unlink()  # as if it had not been moved yet
-    made_scene.made_scene(posed, tmp_path / "out")
+    scene_setup.made_scene(posed, tmp_path / "out")
     assert mask.exists()
 
 
@@ -221,5 +238,5 @@ def test_what_lacks_for_masks_is_said_before_poses_are_computed(photos, tmp_path
     model.parent.mkdir(parents=True)
     model.touch()
     with pytest.raises(UserError, match=r"none can be made of what stands out: no onnxruntime\."):
-        made_scene.made_scene(photos, tmp_path / "out")
+        scene_setup.made_scene(photos, tmp_path / "out")
     assert not (tmp_path / "out").exists()

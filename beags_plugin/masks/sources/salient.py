@@ -30,12 +30,14 @@ _MEAN, _SPREAD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225]
 class SalientSource(MaskSource):
     """A network such as U2-Net cuts out what stands out in each training photo, as one object.
 
-    model: a path that ends in .onnx, or the name of a file of rembg's without it (u2netp, u2net, silueta).
+    model: a path that ends in .onnx, or the name of a file of rembg's without it (u2netp, u2net, silueta). name: of the
+    object.
     """
 
     guesses: ClassVar[bool] = True
 
     model: str = "u2netp"
+    name: str = "object"
 
     @classmethod
     def unavailable(cls) -> str | None:
@@ -50,7 +52,7 @@ class SalientSource(MaskSource):
         def labels(photo: Photo) -> np.ndarray | None:
             return large_pieces(saliency(photo.pixels()) > 0.5).astype(np.uint16) if photo.trained else None
 
-        return MadeMasks({0: "background", 1: "object"}, per_photo(scene, progress, labels), [])
+        return MadeMasks({0: "background", 1: self.name}, per_photo(scene, progress, labels), [])
 
 
 def load(path: Path) -> Callable[[np.ndarray], np.ndarray]:
