@@ -33,9 +33,9 @@ class Certainty:
         return {"level": self.level, "sentences": self.lines, **self.figures}
 
 
-def certainty(run: Path, scene: Path, masks: Path | None = None) -> Certainty:
+def certainty(run: Path, scene: Path, masks: Path | None = None, again: str = "beags demo --pick") -> Certainty:
     """Judge a finished demo. run: its run. scene: its photos' folder, with poses.json if poses were made. masks: the
-    folder of masks that were made, from which some may be deleted."""
+    folder of masks that were made, from which some may be deleted. again: the command that has the objects picked."""
     lines, figures = [], {}
     agreement = _json(run / "prepared/report.json").get("agreement")
     level = "not judged" if agreement is None else _level(agreement)
@@ -53,7 +53,7 @@ def certainty(run: Path, scene: Path, masks: Path | None = None) -> Certainty:
         finer = ": for more detail, add --downscale 1" if max(size) < SMALL else ""
         lines.append(f"The object has about {size[0]} x {size[1]} pixels in the photos as they were trained on{finer}.")
     if agreement is not None and level != "sure":
-        lines += _next(run, agreement, masks)
+        lines += _next(again, agreement, masks)
     return Certainty(level, lines, figures)
 
 
@@ -71,9 +71,8 @@ def _of_masks(level: str, agreement: dict[str, Any]) -> str:
     return f"{line}; {100 * agreement['doubtful']:.1f} % of all pixels are in doubt and were left out."
 
 
-def _next(run: Path, agreement: dict[str, Any], masks: Path | None) -> list[str]:
-    lines = ["If the object is not what you meant, pick it by a few clicks, and press Save as masks:",
-             f"    beags view {quoted(run / 'base')}"]  # fmt: skip
+def _next(again: str, agreement: dict[str, Any], masks: Path | None) -> list[str]:
+    lines = ["If the object is not what you meant, pick it by a few clicks:", f"    {again} --fresh"]
     if masks is not None and agreement["overruled"]:
         names = [quoted(masks / f"{name}.png") for name in agreement["overruled"][:NAMED]]
         more = len(agreement["overruled"]) - len(names)

@@ -53,11 +53,19 @@ class Demo:
     """Train again even if the same demo has been trained before."""
     strict: bool = False
     """Stop where masks contradict one another, before anything is trained."""
+    pick: bool = False
+    """Click on the objects in the viewer, which opens when the base is trained; the demo goes on once they are saved.
+    With --fresh they are picked again, on the same base."""
+    objects: int = 1
+    """With --pick: how many objects to click on and name."""
 
     def run(self) -> None:
         with starting(self):
             from beags_plugin.commands.demo import run_demo
-        run_demo(self.data, self.output, self.preset, self.downscale, self.seed, self.fresh, self.strict)
+        run_demo(
+            self.data, self.output, self.preset, self.downscale, self.seed, self.fresh, self.strict, self.pick,
+            self.objects,
+        )  # fmt: skip
 
 
 @dataclass

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,10 +12,16 @@ from typing import TYPE_CHECKING, Any, cast
 
 from rich.console import Console
 
-from beags_plugin.system.child_processes import bound
+from beags_plugin.commands.demo_picks import (
+    check_picked_before,
+    names_of,
+    picked_scene,
+    trained_base,
+    with_made_masks,
+)
+from beags_plugin.commands.demo_training import STARTED, read_stamp, train_once
 from beags_plugin.system.digests import code_digest, value_digest
 from beags_plugin.system.errors import UserError, check_choice
-from beags_plugin.system.lock import run_lock
 from beags_plugin.system.pasted import command, quoted
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
@@ -32,28 +34,26 @@ if TYPE_CHECKING:
     from beags_plugin.plugin.options.model_options import BeagsModelConfig
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-STAMP = "trained.json"  # beside the run: the request that it was made from
-STARTED = "started"  # in there, holds the request until the training ends
+BEFORE = ("sample", "poses", "poses and masks", "base training")  # stages before the training that is measured
 PRESET, PRESET_OF_PHOTOS = "beags-tiny", "beags-fast"
-AGREE = ("--pipeline.model.prepare.agree", "True")  # a network's masks err in many views alike
-QUIET = ("--logging.steps-per-log", "50", "--logging.local-writer.max-log-size", "0")  # where no table can be redrawn
 
 
 def run_demo(
     data: Path | None, output: Path | None, preset: str | None, downscale: float | None, seed: int, fresh: bool,
-    strict: bool = False,
+    strict: bool = False, pick: bool = False, objects: int = 1,
 ) -> None:  # fmt: skip
     """Run the whole demo in ``output`` and print the table; see ``cli.Demo`` for the arguments."""
     from beags_plugin.commands.scene_setup import MadeScene, made_scene, name_of
     from beags_plugin.data.layout import read_dataset
     from beags_plugin.data.quick import quick_downscale
-    from beags_plugin.runs.prepared import photos_contradict
     from beags_plugin.sample.writer import make_sample
 
+    again = _again(data, output, preset, downscale, objects)
     preset = preset or (PRESET if data is None else PRESET_OF_PHOTOS)
     check_preset(preset)
     if downscale is not None and not 1.0 <= downscale < math.inf:
         raise UserError(f"downscale is {downscale}: give 1 (full size) or more.")
+    _check_objects(data, pick, objects, strict)
     seconds: dict[str, float] = {}
     if data is None:
         output = output or Path("outputs/demo")
@@ -65,24 +65,84 @@ def run_demo(
         output = output or Path("outputs") / name_of(data)
         if output.resolve() == data.resolve():
             raise UserError(f"{output} is the data: give another --output.")
-        with timed(seconds, "poses and masks"):
-            scene = made_scene(data, output)
+        if pick:
+            check_picked_before(output, fresh)
+        with timed(seconds, "poses" if pick else "poses and masks"):
+            scene = made_scene(data, output, masks=not pick)
         if strict:
             check_contradictions(scene, output)
         read_dataset(scene.data)  # reports what is missing before a training starts
         downscale = downscale or quick_downscale(scene.data)
-    run = output / "run"
-    request = {"preset": preset, "downscale": downscale, "inputs": _digest(scene, output, preset)}
+    request = {"preset": preset, "downscale": downscale}
+    if pick:
+        assert data is not None
+        scene = _trained_by_picks(scene, output, request, names_of(data, objects), fresh, again, seconds)
+    else:
+        _trained_by_masks(scene, output, request, fresh)
+    measure(output / "run", output, seconds, scene, again)
+    if pick:
+        CONSOLE.print(f"If the objects are not what you meant, pick them again on the same base:\n    {again} --fresh")
+
+
+def _trained_by_masks(scene: MadeScene, output: Path, request: dict[str, Any], fresh: bool) -> None:
+    """Train a scene with the masks that it has."""
+    from beags_plugin.runs.prepared import photos_contradict
+
+    request = {**request, "inputs": inputs_digest(scene, output, request["preset"])}
     alone = {**request, "photos": "objects"}
-    if scene.turned or (alone in (former := _read_stamp(output), former.get(STARTED)) and not fresh):
+    if scene.turned or (alone in (former := read_stamp(output), former.get(STARTED)) and not fresh):
         request = alone
-    _train_once(scene, output, request, fresh)
-    if request != alone and photos_contradict(run):
+    train_once(scene, output, request, fresh)
+    if request != alone and photos_contradict(output / "run"):
         CONSOLE.print(
             "The photos contradict each other outside the masks, as on a turntable: now with the objects' pixels alone."
         )
-        _train_once(scene, output, alone, fresh, replace=True)
-    measure(run, output, seconds, scene)
+        train_once(scene, output, alone, fresh, replace=True)
+
+
+def _trained_by_picks(
+    scene: MadeScene, output: Path, request: dict[str, Any], names: Sequence[str], fresh: bool, again: str,
+    seconds: dict[str, float],
+) -> MadeScene:  # fmt: skip
+    """Train the base of a scene, have objects picked on it, and refine with them; return the scene with their masks."""
+    from beags_plugin.runs.prepared import photos_contradict
+
+    kept = inputs_digest(with_made_masks(scene, output), output, request["preset"])
+    base = trained_base(scene, output, request, {**request, "inputs": kept}, fresh)
+    seconds["base training"] = json.loads((base / "training.json").read_text())["seconds"].get("base training", 0.0)
+    scene = picked_scene(scene, output, base, names, fresh, again)
+    request = {**request, "inputs": inputs_digest(scene, output, request["preset"]), "pick": True}
+    words = ("--load-dir", str((base / "nerfstudio_models").absolute()), "--pipeline.model.base-steps", "0")
+    train_once(scene, output, request, fresh, words=words)
+    if photos_contradict(output / "run"):
+        CONSOLE.print(
+            "The photos contradict each other outside the masks, as on a turntable: without --pick, poses and training "
+            "are of the objects alone."
+        )
+    return scene
+
+
+def _check_objects(data: Path | None, pick: bool, objects: int, strict: bool) -> None:
+    """Raise ``UserError`` for options that do not go together."""
+    if objects < 1:
+        raise UserError(f"objects is {objects}: give 1 or more.")
+    if pick and data is None:
+        raise UserError("there is nothing to pick, as the sample has masks: name photos with --data.")
+    if pick and strict:
+        raise UserError("with --pick there are no masks of a network that could contradict: leave --strict out.")
+    if objects > 1 and not pick:
+        raise UserError(
+            "the network marks what stands out in a photo as one object, and cannot tell several apart: add --pick, "
+            f"and click on each of the {objects}."
+        )
+
+
+def _again(data: Path | None, output: Path | None, preset: str | None, downscale: float | None, objects: int) -> str:
+    """Return the command that goes on, or picks."""
+    words = ["beags", "demo", *([] if data is None else ["--data", str(data)])]
+    for name, value in (("output", output), ("preset", preset), ("downscale", downscale)):
+        words += [] if value is None else [f"--{name}", str(value)]
+    return command([*words, *([] if objects == 1 else ["--objects", str(objects)]), "--pick"])
 
 
 def check_contradictions(scene: MadeScene, output: Path) -> None:
@@ -104,34 +164,6 @@ def check_contradictions(scene: MadeScene, output: Path) -> None:
         )
 
 
-def _train_once(scene: MadeScene, output: Path, request: dict[str, Any], fresh: bool, replace: bool = False) -> None:
-    """Train what is requested, unless that was done before, or resume it.
-
-    replace: the run that lies there is a step on the way to this one. Raises ``UserError`` where another run, trained
-    to its end, would be replaced.
-    """
-    run = output / "run"
-    if not fresh and _trained(output, request):
-        CONSOLE.print(f"Trained before: {run} (add --fresh to train again).")
-        return
-    if run.exists() and not (output / STAMP).exists():
-        raise UserError(f"{run} is not the demo's: choose another --output, or move it away.")
-    if run.is_dir():
-        run_lock(run).release()  # refuses if the same demo is being trained
-    if not fresh and _interrupted(output, request):
-        resume(run)
-    else:
-        if (run / "training.json").exists() and not (fresh or replace):
-            raise UserError(
-                f"{run} holds a run that was trained {_difference(_read_stamp(output), request)}: add --fresh to "
-                "replace it, or choose another --output."
-            )
-        shutil.rmtree(run, ignore_errors=True)
-        write_stamp(output, {STARTED: request})
-        train(scene, run, request["preset"], request["downscale"], request.get("photos", "all"))
-    write_stamp(output, request)
-
-
 def check_preset(preset: str) -> None:
     """Raise ``UserError`` unless the preset trains a base and refines it, which is what the demo compares."""
     from beags_plugin.plugin.presets import load_preset, preset_names
@@ -142,7 +174,7 @@ def check_preset(preset: str) -> None:
         raise UserError(f"the demo compares a base with its refinement, and {preset} trains only one: take beags-tiny.")
 
 
-def _digest(scene: MadeScene, output: Path, preset: str) -> str:
+def inputs_digest(scene: MadeScene, output: Path, preset: str) -> str:
     """Return what changes with the preset, the package's code and any file of the data (by name, size and time)."""
     from beags_plugin.plugin.presets import preset_files
 
@@ -150,68 +182,11 @@ def _digest(scene: MadeScene, output: Path, preset: str) -> str:
     return value_digest([*scene.digests(output), code_digest(), *texts])
 
 
-def write_stamp(output: Path, content: dict[str, Any]) -> None:
-    """Write the request that the run in ``output`` was made from, or, under ``STARTED``, is being made from."""
-    write_text_atomically(json.dumps(content), output / STAMP)
+def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene, again: str = "") -> None:
+    """Compare assignment alone with refinement, extract every object, write summary.json and the pictures.
 
-
-def _read_stamp(output: Path) -> dict[str, Any]:
-    try:
-        former = json.loads((output / STAMP).read_text())
-    except (OSError, ValueError):
-        return {}
-    return former if isinstance(former, dict) else {}
-
-
-def _trained(output: Path, request: dict[str, Any]) -> bool:
-    """Return whether the same request was trained before, to its end."""
-    former = _read_stamp(output)
-    return request in (former, former.get(STARTED)) and (output / "run" / "training.json").exists()
-
-
-def _difference(stamp: dict[str, Any], request: dict[str, Any]) -> str:
-    """Return in which way an earlier request, as its stamp holds it, differs from ``request``."""
-    former = stamp.get(STARTED, stamp)
-    for name, flag in (("preset", "--preset"), ("downscale", "--downscale")):
-        if former.get(name) != request.get(name):
-            return f"with {flag} {former.get(name)}"
-    return "from other data or by another version"
-
-
-def _interrupted(output: Path, request: dict[str, Any]) -> bool:
-    """Return whether a training of the same request was interrupted and can resume."""
-    return _read_stamp(output).get(STARTED) == request and (output / "run" / "config.yml").exists()
-
-
-def train(scene: MadeScene, run: Path, preset: str, downscale: float, photos: str) -> None:
-    """Run ns-train in a process of its own, as a user would."""
-    words = [
-        str(Path(sys.executable).parent / "ns-train"), preset, "--data", str(scene.data),
-        "--run-dir", str(run.absolute()), "--vis", "tensorboard", "--pipeline.datamanager.photos", photos,
-        *(AGREE if scene.made_masks is not None and photos == "all" else ()), *(() if sys.stdout.isatty() else QUIET),
-        "beags-data", "--downscale-factor", str(downscale), *scene.options(),
-    ]  # fmt: skip
-    CONSOLE.print(f"$ {command(words)}")
-    _finish(words)
-
-
-def resume(run: Path) -> None:
-    """Resume an interrupted training in a process of its own."""
-    CONSOLE.print(
-        f"Resuming the training that was interrupted (add --fresh to start anew).\n$ beags resume {quoted(run)}"
-    )
-    _finish([sys.executable, "-m", "beags_plugin.commands.cli", "resume", str(run)])
-
-
-def _finish(words: list[str]) -> None:
-    quiet = {**os.environ, "PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS", "ignore::FutureWarning")}
-    code = subprocess.run(bound(words), env=quiet).returncode
-    if code != 0:
-        raise UserError(f"training ended with exit code {code}; what it printed above says why.")
-
-
-def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene) -> None:
-    """Compare assignment alone with refinement, extract every object, write summary.json and the pictures."""
+    again: the command that has the objects picked.
+    """
     from beags_plugin.commands.certainty import certainty, write_doubt
     from beags_plugin.evaluation.table import render_run, summary_json
     from beags_plugin.objects.evaluate import EvaluatedRun
@@ -235,10 +210,10 @@ def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene
         )  # fmt: skip
         write_picture(picture, sheet)
     training = json.loads((run / "training.json").read_text())
-    made = {name: seconds.pop(name) for name in ("sample", "poses and masks") if name in seconds}
-    stages = {**made, **training["seconds"], **seconds}
+    made = {name: seconds.pop(name) for name in BEFORE if name in seconds}
+    stages = {**made, **{name: taken for name, taken in training["seconds"].items() if name not in made}, **seconds}
     memory = training["peak_memory_mb"]
-    sure = certainty(run, scene.data, scene.made_masks)
+    sure = certainty(run, scene.data, scene.made_masks, again)
     summary = {**summary_json(metrics, stages, memory), "certainty": sure.to_json()}
     write_text_atomically(json.dumps(summary, indent=2), output / "summary.json")
     doubt = write_doubt(run, output / "doubt.png")

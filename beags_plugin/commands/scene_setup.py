@@ -73,19 +73,19 @@ def name_of(data: Path) -> str:
 def object_name(data: Path) -> str:
     """Return what the one object of photos is called: as their folder or video, where that can name a class."""
     name = name_of(data).strip()
-    return name if name and name.isprintable() and name != "background" else "object"
+    return name if name.isprintable() and name not in ("", "background") and not name.startswith("-") else "object"
 
 
-def made_scene(data: Path, output: Path) -> MadeScene:
+def made_scene(data: Path, output: Path, masks: bool = True) -> MadeScene:
     """Return the scene in ``data``, or one made below ``output`` of photos without poses, or without masks.
 
-    data: a scene, a folder of photos (or with images/, perhaps masks/), or a video. What an earlier call made of the
-    same photos is taken as it is; masks also where the user has mended them. Raises ``UserError``; where masks cannot
-    be made, before poses are computed.
+    data: a scene, a folder of photos (or with images/, perhaps masks/), or a video. masks: whether they are needed.
+    What an earlier call made of the same photos is taken as it is; masks also where the user has mended them. Raises
+    ``UserError``; where masks cannot be made, before poses are computed.
     """
     if data.is_dir() and (fitting_layouts(data) or any(any(data.glob(pattern)) for pattern in POSES)):
         read_dataset(data)  # says what lacks or is too much
-        if _has_masks(data):
+        if not masks or _has_masks(data):
             return MadeScene(data)
         check_source()
         return MadeScene(data, made_masks(data, output / "made", object_name(data)))
@@ -93,6 +93,11 @@ def made_scene(data: Path, output: Path) -> MadeScene:
     given = data if any((data / "masks").rglob("*.png")) else None
     scene = output / "scene"
     _check_other(data, scene)
+    if not masks:
+        CONSOLE.print(f"{data} has no poses, so they are computed from the photos.")
+        _print_poses(data, scene)
+        _write_origin(data, scene)
+        return MadeScene(scene)
     if given is None:
         check_source()
     elif find_spec("pycolmap") is not None:  # else the next step says so
@@ -105,8 +110,7 @@ def made_scene(data: Path, output: Path) -> MadeScene:
         CONSOLE.print("The photos as a whole give no poses, so poses of the objects alone are tried.")
         if (own := _scene_of_objects(scene, output / "turned", given, object_name(data), room=False)) is None:
             raise error
-    if not (scene / MADE_OF).exists():
-        write_text_atomically(json.dumps(str(data.resolve())), scene / MADE_OF)
+    _write_origin(data, scene)
     if own is not None:
         return own
     if given is not None and (scene / MADE).exists():
@@ -161,6 +165,11 @@ def _all_masks(photos: Path, labels: Path, name: str, mended: Path | None) -> No
         same = labels / "masks" / mask.name
         if not same.exists() or same.read_bytes() != mask.read_bytes():
             shutil.copyfile(mask, same)
+
+
+def _write_origin(data: Path, scene: Path) -> None:
+    if not (scene / MADE_OF).exists():
+        write_text_atomically(json.dumps(str(data.resolve())), scene / MADE_OF)
 
 
 def _check_other(data: Path, scene: Path) -> None:

@@ -89,6 +89,11 @@ def option_words(parser: DataOptions) -> list[str]:
     return ["beags-data", *words] if words else []
 
 
+def masks_changed(folder: Path) -> bool:
+    """Return whether a folder has masks that were not written by ``save_masks``, or have been changed since."""
+    return not _free(folder)
+
+
 def _holds_masks(folder: Path) -> bool:
     return any((folder / "masks").rglob("*.png")) or (folder / "classes.json").exists()
 

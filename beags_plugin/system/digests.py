@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +22,17 @@ def code_digest() -> str:
     return digest.hexdigest()
 
 
-def folder_digest(folder: Path, without: Path | None = None) -> str:
+def folder_digest(folder: Path, without: Path | None = None, names: Collection[str] = ()) -> str:
     """Digest path, size and time of every file of ``folder`` whose name begins with no dot (as locks do).
 
-    without: a folder whose content does not count, such as what was made of the files.
+    without: a folder whose content does not count, such as what was made of the files. names: of files and folders in
+    ``folder`` that do not count either.
     """
     digest = hashlib.sha256(str(folder.resolve()).encode())
     left_out = None if without is None else without.resolve()
     for path in sorted(path for path in folder.rglob("[!.]*") if path.is_file()):
-        if left_out is None or not path.resolve().is_relative_to(left_out):
+        counts = left_out is None or not path.resolve().is_relative_to(left_out)
+        if counts and path.relative_to(folder).parts[0] not in names:
             stat = path.stat()
             digest.update(f"{path.relative_to(folder)} {stat.st_size} {stat.st_mtime_ns}".encode())
     return digest.hexdigest()

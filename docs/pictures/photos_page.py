@@ -15,7 +15,7 @@ PARTS = {  # picture: file of the demo, and which share of its height is kept
     "poses": ("scene/poses.png", 1.0),
     "made": ("scene/made.png", 0.4),
     "contradicted": ("scene/contradicted.png", 0.33),
-    "sheet": ("contact_sheet.png", 0.5),
+    "sheet": ("contact_sheet.png", 1.0),
 }
 
 

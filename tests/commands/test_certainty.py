@@ -11,7 +11,7 @@ import pytest
 from data_folders import write_image
 from run_folders import write_scene
 
-from beags_plugin.commands import demo
+from beags_plugin.commands import demo, demo_training
 from beags_plugin.commands.certainty import certainty
 from beags_plugin.commands.made_masks import MADE, as_made
 from beags_plugin.commands.scene_setup import MadeScene
@@ -45,7 +45,7 @@ def test_the_words_follow_from_what_the_masks_agree_on(tmp_path, agreement, over
     assert found.level == level and found.to_json()["level"] == level
     said = " ".join(found.lines)
     assert (f"How sure: {level}" in said) == (agreement is not None)
-    assert ("beags view" in said) == (level in ("fairly sure", "not sure"))
+    assert ("beags demo --pick --fresh" in said) == (level in ("fairly sure", "not sure"))
     assert "40 x 20 pixels" in said and "--downscale 1" in said
     assert found.figures["object pixels"] == [40, 20]
 
@@ -63,12 +63,12 @@ def test_photos_without_poses_and_masks_to_delete_are_named(tmp_path):
 
 def test_masks_that_a_network_made_are_made_to_agree_and_those_that_were_mended_are_not(tmp_path, monkeypatch):
     data, words = write_scene(tmp_path / "data"), []
-    monkeypatch.setattr(demo, "_finish", words.extend)
+    monkeypatch.setattr(demo_training, "finish", words.extend)
     scene = MadeScene(data)
 
     def agrees(photos: str = "all") -> bool:
         words.clear()
-        demo.train(scene, tmp_path / "run", "beags-tiny", 1.0, photos)
+        demo_training.train(scene, tmp_path / "run", "beags-tiny", 1.0, photos)
         return "--pipeline.model.prepare.agree" in words
 
     assert not agrees()  # the user's own
@@ -87,7 +87,7 @@ def test_strict_stops_before_training_where_masks_contradict(tmp_path, monkeypat
     with pytest.raises(UserError, match=r"1 masks contradict the others \(v03; see .*contradicted.png\)"):
         demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, False, True)
     assert not (tmp_path / "out/run").exists()
-    monkeypatch.setattr(demo, "_train_once", lambda *_: None)
+    monkeypatch.setattr(demo, "train_once", lambda *_: None)
     monkeypatch.setattr(demo, "measure", lambda *_: None)
     demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, False)
     report.contradictions.clear()

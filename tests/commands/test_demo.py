@@ -12,9 +12,10 @@ import pytest
 from data_folders import write_image
 from run_folders import write_scene
 
-from beags_plugin.commands import demo
+from beags_plugin.commands import demo, demo_training
 from beags_plugin.commands.cli import main
-from beags_plugin.commands.demo import STAMP, _trained, check_preset
+from beags_plugin.commands.demo import check_preset
+from beags_plugin.commands.demo_training import STAMP, trained
 from beags_plugin.data.quick import quick_downscale
 from beags_plugin.plugin.options.config import base_config
 from beags_plugin.system.errors import UserError
@@ -70,11 +71,11 @@ def test_a_run_that_is_not_the_demos_is_kept(tmp_path):
 def test_a_damaged_stamp_means_not_trained(tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run/training.json").write_text("{}")
-    assert not _trained(tmp_path, {"preset": "beags-tiny"})
+    assert not trained(tmp_path, {"preset": "beags-tiny"})
     (tmp_path / STAMP).write_text("{")
-    assert not _trained(tmp_path, {"preset": "beags-tiny"})
+    assert not trained(tmp_path, {"preset": "beags-tiny"})
     (tmp_path / STAMP).write_text(json.dumps({"preset": "beags-tiny"}))
-    assert _trained(tmp_path, {"preset": "beags-tiny"})
+    assert trained(tmp_path, {"preset": "beags-tiny"})
 
 
 def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
@@ -98,7 +99,7 @@ def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
         if len(measured) == 1:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(demo.subprocess, "run", process)
+    monkeypatch.setattr(demo_training.subprocess, "run", process)
     monkeypatch.setattr(demo, "measure", measure)
 
     def again(downscale=None, fresh=False):
@@ -131,7 +132,7 @@ def test_photos_of_a_turntable_are_trained_on_again_by_their_objects(tmp_path, m
             raise KeyboardInterrupt
         (run / "training.json").write_text("{}")
 
-    monkeypatch.setattr(demo, "_finish", finish)
+    monkeypatch.setattr(demo_training, "finish", finish)
     monkeypatch.setattr(demo, "measure", lambda *_: None)
 
     def again() -> list[str]:

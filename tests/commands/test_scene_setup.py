@@ -15,7 +15,7 @@ from run_folders import write_scene
 from test_documented_commands import training_config
 from weights import fetch
 
-from beags_plugin.commands import demo, scene_setup
+from beags_plugin.commands import demo, demo_training, scene_setup
 from beags_plugin.commands.scene_setup import MadeScene
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.masks.sources.salient import SalientSource
@@ -63,7 +63,7 @@ def trainings(monkeypatch):
         config.run_dir.mkdir(parents=True)
         (config.run_dir / "training.json").write_text("{}")
 
-    monkeypatch.setattr(demo, "_finish", train)
+    monkeypatch.setattr(demo_training, "finish", train)
     monkeypatch.setattr(demo, "measure", lambda *_: None)
     return commands
 

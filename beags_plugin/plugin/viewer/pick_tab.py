@@ -39,7 +39,7 @@ class PickTab:
     ) -> None:  # fmt: skip
         self.server = server
         self.viewing = viewing
-        self.note = _HELP
+        self.note = self._help = _HELP if viewing.errand is None else viewing.errand.help()
         self.command = ""
         self._labels = labels
         self._redraw = redraw
@@ -49,7 +49,8 @@ class PickTab:
         self.work = PickWork(viewing, self.report, self.refresh, self.picture)
         gui = server.gui
         formats = EXPORTERS.names()
-        with another_tab(gui, "Pick"):
+        errand = viewing.errand
+        with another_tab(gui, "Pick", first=errand is not None):
             self.picked = gui.add_dropdown("Picked", ["object 1"], hint="What the next click is about")
             self.name = gui.add_text("Name", "object 1")
             self.new = gui.add_button("Another object")
@@ -63,7 +64,10 @@ class PickTab:
             self._sides = gui.add_markdown("")
             self.format = gui.add_dropdown("As", formats, "ply" if "ply" in formats else formats[0])
             self.export = gui.add_button("Export the picked object")
-            self.folder = gui.add_text("Masks to", str(self._usual_folder()), hint="Folder that Save as masks writes")
+            self.folder = gui.add_text(
+                "Masks to", str(self._usual_folder()), disabled=errand is not None,
+                hint="Folder that Save as masks writes",
+            )  # fmt: skip
             self.masks = gui.add_button("Save as masks", hint="Of all objects, for the training views")
             self._where = gui.add_markdown("")
             self.keep = gui.add_button("Keep in the run", hint="As its objects, for every command")
@@ -72,6 +76,10 @@ class PickTab:
         self._say_where()
         self._listen()
         self.refresh()
+        if errand is not None:
+            self.keep.visible = False
+            self.clicks.value = True
+            errand.serve(server)
 
     def _listen(self) -> None:
         self.picked.on_update(by_user(lambda: self._choose(self.picked.value)))
@@ -83,7 +91,7 @@ class PickTab:
         self.alone.on_update(by_user(lambda: self.work.show_alone(self.alone.value)))
         self.export.on_click(lambda _: self.files.start())
         self.folder.on_update(lambda _: self._say_where())
-        self.masks.on_click(lambda _: self.work.save_masks(self._folder()))
+        self.masks.on_click(lambda _: self._save())
         self.keep.on_click(lambda _: self.work.keep())
 
     # -- pointing ----------------------------------------------------------------------------------------------------
@@ -105,7 +113,7 @@ class PickTab:
             self.report("Drag a box over the picture; press again to leave it.")
         else:
             self.server.scene.remove_pointer_callback()
-            self.report(_HELP)
+            self.report(self._help)
 
     def boxed(self, event: ScenePointerEvent) -> None:
         """Mark a box."""
@@ -142,6 +150,10 @@ class PickTab:
         if name != self.work.picks.chosen.name:
             self.work.change(lambda picks: picks.named(name))
 
+    def _save(self) -> None:
+        errand = self.viewing.errand
+        self.work.save_masks(self._folder(), None if errand is None else lambda: errand.end(self.server))
+
     def _title(self) -> str:
         return f"picked_{self.work.picks.chosen.name}"
 
@@ -162,7 +174,8 @@ class PickTab:
 
     def _usual_folder(self) -> Path:
         assert self.viewing.run is not None
-        return masks_folder(self.viewing.run.folder)
+        errand = self.viewing.errand
+        return masks_folder(self.viewing.run.folder) if errand is None else errand.folder
 
     def _folder(self) -> Path:
         typed = self.folder.value.strip()
@@ -170,7 +183,8 @@ class PickTab:
 
     def _say_where(self) -> None:
         with suppress(KeyError):  # the viewer is being closed
-            where = wrapped(f"Save as masks writes to {self._folder()}")
+            ends = "" if self.viewing.errand is None else ", and ends the viewer: the program that opened it goes on"
+            where = wrapped(f"Save as masks writes to {self._folder()}{ends}")
             after = f"\n\nRefine with the saved ones:\n\n{pasteable(self.command)}" if self.command else ""
             self._where.content = where + after
 

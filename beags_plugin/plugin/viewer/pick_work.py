@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.membership import Membership
+from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.labels.colors import colorize
 from beags_plugin.objects.picked_masks import save_masks
 from beags_plugin.picking.cutter import Cutter, takes_much
@@ -58,13 +59,14 @@ class PickWork:
         self, viewing: Viewing, report: Callable[..., None], changed: Callable[[], None],
         pictured: Callable[[str], None] = lambda _: None,
     ) -> None:  # fmt: skip
-        self.picks = Picks()
+        self.picks = Picks() if viewing.errand is None else viewing.errand.picks()
         self.alone = False
         self._viewing = viewing
         self._report = report
         self._changed = changed
         self._pictured = pictured
         self._history: list[Picks] = []
+        self._asked = ""  # the doubt that Save as masks has been answered with
         self._made: Cutter | None = None
         self._shown: Tensor | None = None  # the members whose other sides are shown
         self._steps: queue.SimpleQueue[Callable[[], str]] = queue.SimpleQueue()
@@ -114,15 +116,29 @@ class PickWork:
 
         self._steps.put(do)
 
-    def save_masks(self, folder: Path | None = None) -> None:
-        """Draw all objects into masks of the training views; see ``picked_masks.save_masks``."""
+    def save_masks(self, folder: Path | None = None, ended: Callable[[], None] | None = None) -> None:
+        """Draw all objects into masks of the training views; see ``picked_masks.save_masks``.
+
+        ended: called once they are saved for an errand, whose doubts stop only the first try.
+        """
 
         def do() -> str:
+            errand = self._viewing.errand
+            if errand is not None and (doubt := errand.doubt(self.picks) or "") not in ("", self._asked):
+                self._asked = doubt
+                return doubt
             members, names = self._viewing.model.members(), self._viewing.model.classes
             if self.picks.changed() or not any(members.present()):  # there may be objects of the run alone
                 members, names = self.picks.applied(members, names)
             self._report("Drawing masks of all training views ...")
+            if errand is not None:  # classes of masks that the scene may have are not asked for
+                names = {each: name for each, name in names.items() if each in (BACKGROUND, *members.present())}
             saved = save_masks(self._run() / "config.yml", members, names, folder)
+            if ended is not None:
+                say(saved.said)
+                self._report(f"{saved.said} The viewer closes now; the program that opened it goes on.")
+                ended()
+                return ""
             say(f"{saved.said} To refine with them:\n{saved.command}")
             self._report(saved.said, saved.command)
             return ""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import torch
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.pipelines.base_pipeline import Pipeline
 from nerfstudio.scripts.viewer.run_viewer import _start_viewer
 
+from beags_plugin.core.membership import Membership
 from beags_plugin.plugin.options.config import base_config
 from beags_plugin.plugin.options.machine import default_device
 from beags_plugin.plugin.options.saved_config import open_for_training
@@ -20,6 +21,8 @@ from beags_plugin.runs.relocation import check_data
 
 if TYPE_CHECKING:
     from beags_plugin.plugin.options.config import BeagsTrainerConfig
+    from beags_plugin.plugin.viewer.errand import Errand
+    from beags_plugin.plugin.viewer.viewing import Viewing
 
 HOST = "127.0.0.1"
 
@@ -43,9 +46,18 @@ def viewed_pipeline(config_path: Path, data: Path | None = None) -> tuple[BeagsT
     return config, pipeline, checkpoint["step"]
 
 
-def serve(config_path: Path, data: Path | None = None, port: int | None = None) -> None:
-    """Show a run in the browser until Ctrl-C; see ``viewed_pipeline``. port: the first free one if None."""
+def serve(config_path: Path, data: Path | None = None, port: int | None = None, errand: Errand | None = None) -> None:
+    """Show a run in the browser until Ctrl-C; see ``viewed_pipeline``.
+
+    port: the first free one if None. errand: what is to be picked, instead of the run's objects; once it is saved, the
+    process ends.
+    """
     config, pipeline, step = viewed_pipeline(config_path, data)
+    if errand is not None:
+        viewing = cast("Viewing", pipeline.model.viewing)
+        viewing.errand = errand
+        viewing.model.take_members(Membership(torch.zeros_like(viewing.model.class_ids)))
+        viewing.model.assigned.fill_(False)
     config.vis = "viewer"
     config.viewer = ViewerConfig(websocket_host=HOST, websocket_port=port)
     try:

@@ -35,13 +35,20 @@ def first_folder(gui: GuiApi, label: str) -> Iterator[Any]:
     gui._set_container_id(inner)
 
 
-def another_tab(gui: GuiApi, label: str) -> GuiTabHandle:
-    """Add a tab beside those of nerfstudio's panel; return it, for ``with``."""
+def another_tab(gui: GuiApi, label: str, first: bool = False) -> GuiTabHandle:
+    """Add a tab beside those of nerfstudio's panel; return it, for ``with``. first: pages open with it."""
     from viser import GuiTabHandle
 
     folders: Any = gui._container_handle_from_id
     tab = next(handle for handle in folders.values() if isinstance(handle, GuiTabHandle))
-    return tab._parent.add_tab(label)
+    group = tab._parent
+    added = group.add_tab(label)
+    if first:
+        lists: list[list[Any]] = [group._labels, group._icons_html, group._tabs]
+        for listed in lists:
+            listed.insert(0, listed.pop())
+        group._sync_with_client()
+    return added
 
 
 def by_user(listener: Callable[[], None]) -> Callable[[Any], None]:

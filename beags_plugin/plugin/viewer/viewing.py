@@ -32,6 +32,7 @@ from beags_plugin.system.errors import UserError
 if TYPE_CHECKING:
     from nerfstudio.data.scene_box import OrientedBox
 
+    from beags_plugin.plugin.viewer.errand import Errand
     from beags_plugin.plugin.viewer.viewed_run import ViewedRun
 
 CHANNELS = {
@@ -131,7 +132,8 @@ class Viewing:
 
     background: [3], the viewer's. listed: names of ``CHANNELS`` that this run offers; the same ones as long as a viewer
     runs. wanted: returns those that it shows now. crop_box: returns the viewer's. run: the run's files. notes: remarks
-    on the pictures of the last rendering. pace: of the rendering. paint: what has been picked.
+    on the pictures of the last rendering. pace: of the rendering. paint: what has been picked. errand: what is to be
+    picked for a program that waits.
     """
 
     def __init__(self, model: SceneModel) -> None:
@@ -146,6 +148,7 @@ class Viewing:
         self.notes: dict[str, str] = {}
         self.pace = Pace()
         self.paint: Paint | None = None
+        self.errand: Errand | None = None
         self.lock = threading.Lock()
         self._rest_until = 0.0
 

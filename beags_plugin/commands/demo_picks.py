@@ -1,0 +1,128 @@
+"""``beags demo --pick``: the base trains, objects are picked on it in the viewer, and their masks refine it."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from beags_plugin.commands.demo_training import STARTED, quiet_environment, read_stamp, train_once, trained, write_stamp
+from beags_plugin.commands.made_masks import MADE
+from beags_plugin.commands.scene_setup import MadeScene, object_name
+from beags_plugin.data.files import OWN_PICTURES
+from beags_plugin.system.child_processes import bound
+from beags_plugin.system.digests import folder_digest, value_digest
+from beags_plugin.system.errors import UserError
+
+CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
+FOLDER = "pick"  # in the output: run/, the base; masks/ and classes.json, what was picked
+OF_MASKS = ("masks", "masks_to_look_at", "classes.json", MADE, *OWN_PICTURES)  # of a scene: nothing of its base
+
+
+def names_of(data: Path, objects: int) -> tuple[str, ...]:
+    """Return what so many objects of photos are called until somebody names them."""
+    name = object_name(data)
+    return (name,) if objects == 1 else tuple(f"{name} {number}" for number in range(1, objects + 1))
+
+
+def check_picked_before(output: Path, fresh: bool) -> None:
+    """Raise ``UserError`` where another demo, without picks, would be replaced: before anything is trained."""
+    run, stamp = output / "run", read_stamp(output)
+    if not fresh and (run / "training.json").exists() and not stamp.get(STARTED, stamp).get("pick"):
+        raise UserError(
+            f"{run} holds a run that was trained without --pick: add --fresh to replace it (its base is used again), "
+            "or choose another --output."
+        )
+
+
+def with_made_masks(scene: MadeScene, output: Path) -> MadeScene:
+    """Return the scene as the demo without picks trains it, with masks that it has made elsewhere."""
+    made = output / "made"
+    return replace(scene, labels=made if made.exists() else None)
+
+
+def trained_base(
+    scene: MadeScene, output: Path, request: dict[str, Any], without_picks: dict[str, Any], fresh: bool
+) -> Path:
+    """Return the run of the base of a scene; it is trained unless it was before.
+
+    request: preset and size. without_picks: the request of a demo without picks, whose base is the same. fresh: replace
+    a base that was trained otherwise. Raises ``UserError`` as ``train_once`` does.
+    """
+    folder = output / FOLDER
+    request = {**request, "inputs": value_digest([_base_digest(scene, output), "base"])}
+    if not trained(folder, request) and trained(output, without_picks):
+        _copy_base(output / "run", folder, request)
+    if trained(folder, request):
+        CONSOLE.print(f"The base was trained before: {folder / 'run'}.")
+    else:
+        train_once(scene, folder, request, fresh, words=("--pipeline.model.refine-steps", "0"))
+    return folder / "run"
+
+
+def picked_scene(
+    scene: MadeScene, output: Path, base: Path, names: Sequence[str], fresh: bool, again: str
+) -> MadeScene:
+    """Return the scene with the masks of what was picked on its base; the viewer opens unless that was done before.
+
+    names: of the objects that are expected. again: the command that goes on. Raises ``UserError`` where nothing is
+    saved.
+    """
+    from beags_plugin.objects.picked_masks import STAMP, masks_changed
+
+    folder = base.parent
+    there = any((folder / "masks").rglob("*.png"))
+    if there and masks_changed(folder):
+        CONSOLE.print(f"{folder / 'masks'} are not as they were picked, so they stay: delete them for new ones.")
+    elif there and not fresh:
+        CONSOLE.print(f"Picked before: {folder / 'made.png'} (add --fresh to pick again).")
+    else:
+        before = _changed_at(folder / STAMP)
+        _open_viewer(base, folder, names, again)
+        if _changed_at(folder / STAMP) == before:
+            raise UserError(f"nothing was saved in the viewer, so there is no object yet. {_go_on(again)}")
+    return replace(scene, labels=folder)
+
+
+def _open_viewer(base: Path, folder: Path, names: Sequence[str], again: str) -> None:
+    what = names[0] if len(names) == 1 else f"{len(names)} objects"
+    CONSOLE.print(f"Now pick {what} in the viewer; the demo goes on by itself once the masks are saved.")
+    words = [sys.executable, "-m", "beags_plugin.commands.cli", "view", str(base), "--save-to", str(folder), "--expect"]
+    try:
+        code = subprocess.run(bound([*words, *names]), env=quiet_environment()).returncode
+    except KeyboardInterrupt:
+        CONSOLE.print(f"\nNothing was saved in the viewer. {_go_on(again)}")
+        raise
+    if code:
+        raise UserError(f"the viewer ended with exit code {code}; what it printed above says why. {_go_on(again)}")
+
+
+def _go_on(again: str) -> str:
+    return f"The base stays; go on with:\n    {again}"
+
+
+def _copy_base(run: Path, folder: Path, request: dict[str, Any]) -> None:
+    """Take the base that a demo without picks has kept."""
+    unfinished = folder / "run.unfinished"
+    shutil.rmtree(unfinished, ignore_errors=True)
+    shutil.copytree(run / "base", unfinished)
+    shutil.copyfile(run / "training.json", unfinished / "training.json")
+    shutil.rmtree(folder / "run", ignore_errors=True)
+    write_stamp(folder, request)
+    unfinished.rename(folder / "run")
+    CONSOLE.print(f"The base of {run} is used again: {folder / 'run'}.")
+
+
+def _base_digest(scene: MadeScene, output: Path) -> str:
+    inside = scene.data.resolve().is_relative_to(output.resolve())
+    return folder_digest(scene.data, without=None if inside else output, names=OF_MASKS)
+
+
+def _changed_at(path: Path) -> int | None:
+    return path.stat().st_mtime_ns if path.exists() else None

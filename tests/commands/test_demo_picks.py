@@ -1,0 +1,157 @@
+"""``beags demo --pick``: base, viewer, refinement, each once; what is said where nothing was saved."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from data_folders import write_image
+from run_folders import write_scene
+
+from beags_plugin.commands import demo, demo_picks, demo_training
+from beags_plugin.commands.cli import main
+from beags_plugin.objects import picked_masks
+from beags_plugin.system.errors import UserError
+
+
+class Stand:
+    """A demo whose trainings and viewer only leave what says that they ended; said: the programs that were started."""
+
+    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.data = write_scene(root / "bear", masks=False)
+        (self.data / "classes.json").unlink()
+        self.output = root / "out"
+        self.said: list[list[str]] = []
+        self.saves, self.code, self.error = True, 0, None
+        monkeypatch.setattr(demo_training, "finish", self.train)
+        monkeypatch.setattr(demo_picks, "subprocess", SimpleNamespace(run=self.view))
+        monkeypatch.setattr(demo, "measure", lambda *_: self.said.append(["measured"]))
+
+    def train(self, words: list[str]) -> None:
+        self.said.append(words)
+        run = Path(words[words.index("--run-dir") + 1])
+        (run / "base").mkdir(parents=True)
+        (run / "base/config.yml").write_text(words[1])
+        (run / "training.json").write_text(json.dumps({"seconds": {"base training": 3.0}}))
+
+    def view(self, words: list[str], **_) -> SimpleNamespace:
+        words = words[words.index("view") :]
+        self.said.append(words)
+        if self.error is not None:
+            raise self.error
+        if self.saves:
+            folder = Path(words[words.index("--save-to") + 1])
+            write_image(folder / "masks/v01.png", np.full((60, 100), len(self.said) % 2, np.uint8))
+            (folder / "classes.json").write_text('{"1": "bear"}')
+            (folder / picked_masks.STAMP).write_text(picked_masks._digest(folder))
+        return SimpleNamespace(returncode=self.code)
+
+    def run(self, fresh: bool = False, pick: bool = True, objects: int = 1) -> list[str]:
+        """Run the demo; return what was started, in a word each."""
+        self.said.clear()
+        demo.run_demo(self.data, self.output, "beags-tiny", None, 0, fresh, pick=pick, objects=objects)
+        return [self.kind(words) for words in self.said]
+
+    @staticmethod
+    def kind(words: list[str]) -> str:
+        if "--load-dir" in words:
+            return "refined"
+        return "base" if "--pipeline.model.refine-steps" in words else "both" if len(words) > 9 else words[0]
+
+
+@pytest.fixture
+def stand(tmp_path, monkeypatch) -> Stand:
+    return Stand(tmp_path, monkeypatch)
+
+
+def test_base_viewer_and_refinement_follow_one_another_and_each_is_done_once(stand, capsys):
+    assert stand.run() == ["base", "view", "refined", "measured"]
+    again = f"beags demo --data {stand.data} --output {stand.output} --preset beags-tiny --pick --fresh"
+    assert capsys.readouterr().out.endswith(f"pick them again on the same base:\n    {again}\n")
+    base, view, refined, _ = stand.said
+    assert base[base.index("--pipeline.model.refine-steps") + 1] == "0"
+    pick = stand.output / "pick"
+    assert view == ["view", str(pick / "run"), "--save-to", str(pick), "--expect", "bear"]
+    assert refined[refined.index("--load-dir") + 1] == str(pick / "run/nerfstudio_models")
+    assert refined[refined.index("--pipeline.model.base-steps") + 1] == "0"
+    assert refined[refined.index("--masks-path") + 1] == str(pick / "masks")
+    assert refined[refined.index("--classes-path") + 1] == str(pick / "classes.json")
+    assert stand.run() == ["measured"]
+    assert stand.run(fresh=True) == ["view", "refined", "measured"]  # picked again, on the same base
+    assert stand.run() == ["measured"]
+
+
+def test_several_objects_are_expected_under_names_that_tell_them_apart(stand):
+    stand.run(objects=3)
+    assert stand.said[1][-4:] == ["--expect", "bear 1", "bear 2", "bear 3"]
+
+
+def test_a_viewer_that_is_closed_without_saving_is_opened_again_by_the_next_call(stand):
+    stand.saves = False
+    with pytest.raises(
+        UserError, match=r"nothing was saved .* The base stays; go on with:\n    beags demo --data "
+    ) as end:
+        stand.run()
+    assert str(end.value).endswith(f"--output {stand.output} --preset beags-tiny --pick")
+    assert not (stand.output / "run").exists()
+    stand.saves = True
+    assert stand.run() == ["view", "refined", "measured"]
+    stand.saves = False
+    with pytest.raises(UserError, match="nothing was saved"):
+        stand.run(fresh=True)
+    assert stand.run() == ["measured"]  # with what was picked before
+
+
+def test_a_viewer_that_is_interrupted_or_fails_tells_how_to_go_on(stand, capsys):
+    stand.error = KeyboardInterrupt()
+    with pytest.raises(KeyboardInterrupt):
+        stand.run()
+    assert "Nothing was saved in the viewer. The base stays; go on with:\n    beags demo" in capsys.readouterr().out
+    stand.error, stand.code = None, 3
+    with pytest.raises(UserError, match=r"viewer ended with exit code 3; .* go on with:\n    beags demo .* --pick"):
+        stand.run()
+
+
+def test_masks_that_were_mended_after_picking_stay(stand, capsys):
+    stand.run()
+    write_image(stand.output / "pick/masks/v01.png", np.full((60, 100), 1, np.uint8))
+    write_image(stand.output / "pick/masks/v02.png", np.full((60, 100), 1, np.uint8))
+    assert stand.run(fresh=True) == ["refined", "measured"]
+    assert "are not as they were picked, so they stay" in capsys.readouterr().out
+
+
+def test_the_base_of_a_demo_without_picks_is_used_again_and_its_run_is_replaced_only_if_asked_for(stand, monkeypatch):
+    monkeypatch.setattr("beags_plugin.masks.sources.salient.load", lambda _: lambda photo: photo[..., 0] > -1)
+    monkeypatch.setattr("beags_plugin.commands.scene_setup.check_source", lambda: None)
+    assert stand.run(pick=False) == ["both", "measured"]
+    kept = (stand.output / "run/base/config.yml").read_text()
+    with pytest.raises(UserError, match=r"out/run holds a run that was trained without --pick: add --fresh"):
+        stand.run()
+    assert stand.said == [] and (stand.output / "run/training.json").exists()
+    assert stand.run(fresh=True) == ["view", "refined", "measured"]
+    assert (stand.output / "pick/run/config.yml").read_text() == kept
+    with pytest.raises(UserError, match=r"trained with --pick: add --fresh"):
+        stand.run(pick=False)
+    shutil.rmtree(stand.output / "pick")
+    assert stand.run(fresh=True)[0] == "base"  # that of the picked run is not taken for one without picks
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--pick"], "there is nothing to pick, as the sample has masks: name photos with --data."),
+        (["--data", ".", "--pick", "--objects", "0"], "objects is 0: give 1 or more."),
+        (["--data", ".", "--pick", "--strict"], "leave --strict out."),
+        (["--data", ".", "--objects", "3"], "cannot tell several apart: add --pick, and click on each of the 3."),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused_at_once(tmp_path, monkeypatch, capsys, words, sentence):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        main(["demo", *words])
+    assert end.value.code == 2 and sentence in " ".join(capsys.readouterr().out.split())
+    assert not list(tmp_path.iterdir())
