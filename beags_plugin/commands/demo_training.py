@@ -22,7 +22,7 @@ from beags_plugin.system.whole_files import write_text_atomically
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 STAMP = "trained.json"  # beside the run: the request that it was made from
-STARTED = "started"  # in there, holds the request until the training ends
+STARTED = "started"  # the key that holds the request until the training ends
 AGREE = ("--pipeline.model.prepare.agree", "True")  # a network's masks err in many views alike
 QUIET = ("--logging.steps-per-log", "50", "--logging.local-writer.max-log-size", "0")  # where no table can be redrawn
 

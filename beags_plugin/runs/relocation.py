@@ -53,7 +53,7 @@ def relocate(config: Placed, config_path: Path, data: Path | None) -> None:
     found = recorded if data is None else data
     if data is None and not recorded.exists():
         near = [folder / os.path.relpath(recorded, trained_in)]  # where it would be if all was moved together
-        near += [parent / _name(recorded) for parent in (folder, *folder.parents[:2])]  # for base and extracted too
+        near += [parent / _name(recorded) for parent in (folder, *folder.parents[:2])]  # base and extracted lie deeper
         found = next((place.resolve() for place in near if place.exists()), recorded)
     if found != recorded:
         config.data_config.data = config.data_config.dataparser.data = found

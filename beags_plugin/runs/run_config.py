@@ -31,7 +31,7 @@ from beags_plugin.views.data_options import DataOptions, RunViewOptions
 Config = TypeVar("Config")
 _PATHS = (pathlib.PurePath, pathlib.PosixPath, pathlib.WindowsPath, pathlib.Path, pathlib.PurePosixPath)
 _FUNCTIONS = {"nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate"}  # the only one in nerfstudio's configs
-MOVED = {"beags_plugin.plugin.options.loss_spec.LossSpec": LossSpec}  # as older runs name classes
+MOVED = {"beags_plugin.plugin.options.loss_spec.LossSpec": LossSpec}  # older runs name classes so
 _GONE = ("beags_plugin.plugin.options.pyramid.PyramidConfig",)  # options of runs that still open without them
 BEGINNINGS = ("load_dir", "load_checkpoint", "load_config", "load_step")  # what a run was started from
 _GROUPS = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")

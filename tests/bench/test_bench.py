@@ -60,6 +60,7 @@ def miniature(tmp_path_factory):
     return path, options, run_experiment(path, options)
 
 
+@pytest.mark.slow("an experiment is trained for it")
 def test_trials_are_trained_measured_and_reported(miniature):
     _, options, rows = miniature
     by_name = {row.variant.name: row for row in rows}
@@ -87,6 +88,7 @@ def test_trials_are_trained_measured_and_reported(miniature):
         assert (options.output / name).stat().st_size > 10_000
 
 
+@pytest.mark.slow("an experiment is trained for it")
 def test_the_plan_runs_nothing_and_knows_what_is_done(miniature, tmp_path, monkeypatch, capsys):
     path, options, _ = miniature
     monkeypatch.setattr(trial_folder.Worker, "run", None)
@@ -112,6 +114,7 @@ def test_methods_of_the_comparison_are_its_variants(tmp_path, capsys):
     assert "4 trials" not in printed[2], "without the option all of them"
 
 
+@pytest.mark.slow("an experiment is trained for it")
 def test_a_second_call_trains_only_what_failed(miniature, monkeypatch):
     path, options, rows = miniature
     ran = []
@@ -126,6 +129,7 @@ def test_a_second_call_trains_only_what_failed(miniature, monkeypatch):
     assert [row.figures for row in again] == [row.figures for row in rows]
 
 
+@pytest.mark.slow("an experiment is trained for it")
 def test_what_an_interruption_left_is_not_trained_again(miniature):
     """One trial was killed before its scores, one in its last step: both end with the same figures."""
     path, options, rows = miniature

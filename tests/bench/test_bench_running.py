@@ -173,6 +173,7 @@ worker.serve()
 """
 
 
+@pytest.mark.slow("starts a trial in a process of its own")
 def test_where_there_is_a_gpu_a_trial_imports_for_itself(tmp_path):
     """Imports start CUDA there, and a process that is forked after that cannot use it."""
     (tmp_path / "trial.json").write_text("{")

@@ -7,6 +7,8 @@ import json
 import sys
 from pathlib import Path
 
+import pytest
+
 sys.path.append(str(Path(__file__).parent.parent))  # benchmarks/ is not installed
 
 from benchmarks import scaling
@@ -14,6 +16,7 @@ from benchmarks.scaling import ScalingOptions, run_scaling
 from benchmarks.scaling_stages import STAGES
 
 
+@pytest.mark.slow("trains scenes of several sizes")
 def test_files_and_tables(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(scaling.CONSOLE, "_width", 120)
     rows = run_scaling(ScalingOptions(quick=True, output=tmp_path, json=tmp_path / "deep" / "s.json"))

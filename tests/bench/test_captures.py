@@ -92,6 +92,7 @@ def again(finished, monkeypatch):
     return options
 
 
+@pytest.mark.slow("an experiment on captures is trained for it")
 def test_every_capture_is_trained_on_each_kind_of_masks(finished):
     _, rows, _ = finished
     names = ["assignment alone", "as long as the paper, neither loss", "the paper's losses"]
@@ -106,6 +107,7 @@ def test_every_capture_is_trained_on_each_kind_of_masks(finished):
         assert row.figures["steps"] == (0 if row.variant.name == "assignment alone" else 3)
 
 
+@pytest.mark.slow("an experiment on captures is trained for it")
 def test_masks_are_made_beside_the_trials_and_the_data_stay_as_they_are(finished):
     options, _, before = finished
     assert (files_below(options.data_root), files_below(options.truth)) == before
@@ -121,6 +123,7 @@ def test_masks_are_made_beside_the_trials_and_the_data_stay_as_they_are(finished
     assert len(list((picked / "masks").glob("*.png"))) == 7, "held-out photos get none"
 
 
+@pytest.mark.slow("an experiment on captures is trained for it")
 def test_a_view_without_a_traced_silhouette_is_not_scored(finished):
     options, *_ = finished
     results = [json.loads(path.read_text()) for path in options.output.glob("trials/fruit*refined*/result.json")]
@@ -133,6 +136,7 @@ def test_a_view_without_a_traced_silhouette_is_not_scored(finished):
         )
 
 
+@pytest.mark.slow("an experiment on captures is trained for it")
 def test_files_hold_every_figure_and_the_means_by_masks(finished):
     options, rows, _ = finished
     report = json.loads((options.output / "captures.json").read_text())
@@ -154,6 +158,7 @@ def test_files_hold_every_figure_and_the_means_by_masks(finished):
             assert len(np.unique(colors, axis=0)) > 100
 
 
+@pytest.mark.slow("an experiment on captures is trained for it")
 def test_a_second_call_trains_nothing_and_makes_no_mask(finished, again, monkeypatch, capsys):
     monkeypatch.setattr(trial_folder.Worker, "run", None)
     monkeypatch.setattr(make_masks, "make_masks", None)
@@ -162,6 +167,7 @@ def test_a_second_call_trains_nothing_and_makes_no_mask(finished, again, monkeyp
     assert "18 trials, 0 of them not done." in printed(capsys)
 
 
+@pytest.mark.slow("an experiment on captures is trained for it")
 def test_masks_that_cannot_be_made_are_failed_rows_and_the_others_run(again, tmp_path, monkeypatch, capsys):
     clicks = write_prompts(tmp_path / "held_out.json", "v00")
     monkeypatch.setattr(Capture, "prompts", property(lambda self: clicks))
@@ -172,6 +178,7 @@ def test_masks_that_cannot_be_made_are_failed_rows_and_the_others_run(again, tmp
     assert "failed: assignment alone on bear, picked: " in printed(capsys)
 
 
+@pytest.mark.slow("an experiment on captures is trained for it")
 def test_without_the_network_its_scenes_are_left_out(again, monkeypatch, capsys):
     monkeypatch.setattr(salient.SalientSource, "unavailable", lambda: "the library onnxruntime is not installed.")
     rows = run_captures(replace(again, scenes=("bear", "dtu_skull")))

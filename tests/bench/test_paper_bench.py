@@ -46,6 +46,7 @@ def printed(capsys) -> str:
     return " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.slow("an experiment on scenes of a paper is trained for it")
 def test_what_is_on_disk_is_run_and_scored(finished):
     options, outcomes = finished
     assert [(row.scene, row.variant.name, row.failed) for row in outcomes.rows] == [
@@ -65,6 +66,7 @@ def test_what_is_on_disk_is_run_and_scored(finished):
     assert (options.output / "paper.csv").read_text().count("\n") > 8
 
 
+@pytest.mark.slow("an experiment on scenes of a paper is trained for it")
 def test_each_scene_is_trained_as_its_data_set_says(finished):
     options, _ = finished
     requests = [json.loads(path.read_text()) for path in options.output.glob("trials/*/trial.json")]
@@ -76,6 +78,7 @@ def test_each_scene_is_trained_as_its_data_set_says(finished):
     }
 
 
+@pytest.mark.slow("an experiment on scenes of a paper is trained for it")
 def test_truth_drawn_later_is_scored_without_training_again(finished, capsys):
     options, before = finished
     trainings = {path: path.stat().st_mtime_ns for path in options.output.glob("trials/*/run/training.json")}
@@ -97,6 +100,7 @@ def test_truth_drawn_later_is_scored_without_training_again(finished, capsys):
     assert {path: path.stat().st_mtime_ns for path in trainings} == trainings and len(trainings) == 6
 
 
+@pytest.mark.slow("an experiment on scenes of a paper is trained for it")
 def test_a_drawing_that_is_refused_is_a_row_with_the_reason(finished, capsys):
     options, before = finished
     drawing = next((options.data_root / "llff/fern/ground_truth/silhouettes").rglob("*.png"))
@@ -110,6 +114,7 @@ def test_a_drawing_that_is_refused_is_a_row_with_the_reason(finished, capsys):
     assert [row.figures for row in run_paper(options).rows] == [row.figures for row in before.rows], "and still trained"
 
 
+@pytest.mark.slow("an experiment on scenes of a paper is trained for it")
 def test_the_plan_starts_nothing_and_knows_what_is_done(finished, tmp_path, monkeypatch, capsys):
     options, _ = finished
     monkeypatch.setattr(paper_run, "trained", None)

@@ -17,6 +17,7 @@ from beags_plugin.system.child_processes import bound
 SCRIPT = ROOT / "benchmarks" / "rasterizer.py"
 
 
+@pytest.mark.slow("measures in processes of their own")
 def test_a_quick_benchmark_measures_rows_and_judges_goals(tmp_path):
     target = tmp_path / "result.json"
     done = subprocess.run(

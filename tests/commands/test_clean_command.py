@@ -72,7 +72,7 @@ def test_masks_are_made_where_there_are_none_and_gaussians_with_volume_are_polis
     write(tmp_path / "scene.ply", "ply", scene.surfels)
     main(["clean", "scene.ply", "--data", "data", "--output", "out", "--polish", "2", "--steps", "2"])
     report = json.loads(Path("out/clean.json").read_text())
-    assert asked == [(Path("data"), Path("out/made"))] and report["polish"] == 2
+    assert asked == [(Path("data"), Path("out/made"), "data")] and report["polish"] == 2
     assert report["start"]["flattening"]["median_ratio"] == pytest.approx(1e-3, rel=1e-3)
     assert report["metrics"]["psnr"]["before"] > 30  # The polish comes first.
     assert read_scene(Path("out/scene.cleaned.ply")).kind == "3DGS .ply"

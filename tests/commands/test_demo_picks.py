@@ -103,7 +103,7 @@ def test_a_viewer_that_is_closed_without_saving_is_opened_again_by_the_next_call
     stand.saves = False
     with pytest.raises(UserError, match="nothing was saved"):
         stand.run(fresh=True)
-    assert stand.run() == ["measured"]  # with what was picked before
+    assert stand.run() == ["measured"]  # former picks are taken
 
 
 def test_a_viewer_that_is_interrupted_or_fails_tells_how_to_go_on(stand, capsys):

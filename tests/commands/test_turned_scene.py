@@ -10,7 +10,7 @@ from photographed_corner import HEIGHT, WIDTH, camera, frames, photograph
 pytest.importorskip("nerfstudio")
 pytest.importorskip("pycolmap")
 
-from beags_plugin.commands import demo
+from beags_plugin.commands import demo, demo_training
 from beags_plugin.commands.process import find_poses
 from beags_plugin.commands.scene_setup import MadeScene, made_scene
 from beags_plugin.labels.classes import read_id_mask
@@ -96,11 +96,11 @@ def test_masks_that_were_given_are_taken_and_the_thing_is_trained_on_alone(tmp_p
     for index in range(PHOTOS):
         write_image(tmp_path / f"photos/masks/v{index:02d}.png", THING.astype(np.uint8))
     trained = []
-    monkeypatch.setattr(demo, "train", lambda *arguments: trained.append(arguments))
+    monkeypatch.setattr(demo_training, "train", lambda *arguments: trained.append(arguments))
     monkeypatch.setattr(demo, "measure", lambda *_: None)
     demo.run_demo(tmp_path / "photos", tmp_path / "out", None, 1.0, 0, False)
     scene = MadeScene(tmp_path / "out/turned", tmp_path / "photos", turned=True)
-    assert trained == [(scene, tmp_path / "out/run", "beags-fast", 1.0, "objects")]
+    assert trained == [(scene, tmp_path / "out/run", "beags-fast", 1.0, "objects", ())]
 
 
 def test_a_thing_that_stands_in_its_room_keeps_the_poses_of_both(tmp_path, capsys):

@@ -125,7 +125,7 @@ def test_the_lock_is_held_from_the_first_file_on(data, tmp_path):
     config.save_config()  # not refused by itself
     with pytest.raises(Timeout):
         FileLock(tmp_path / "run" / LOCK).acquire(blocking=False)
-    run_lock(tmp_path / "run").release()  # as the trainer takes it over
+    run_lock(tmp_path / "run").release()  # the trainer takes it over so
     run_lock(tmp_path / "run").release()
 
 
