@@ -22,7 +22,7 @@ setup:
 # (Debian: apt install chromium). Each process has one thread; tests that need more set them.
 PYTEST = BEAGS_REQUIRE_NATIVE=1 OMP_NUM_THREADS=1 "$(BIN)/python" -m pytest -q -n $(JOBS) --dist loadscope --no-loadscope-reorder
 
-# Every room, in about five minutes on two cores.
+# Every room, in about eight minutes on two cores.
 test: setup
 	$(PYTEST) -m "not slow"
 

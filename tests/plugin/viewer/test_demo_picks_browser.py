@@ -30,7 +30,7 @@ from beags_plugin.commands import demo, demo_picks, demo_training
 from beags_plugin.plugin.presets import preset_config
 from beags_plugin.splat_io.ply import read_ply
 
-pytestmark = NEEDED
+pytestmark = [NEEDED, pytest.mark.slow("a browser clicks through a pick by WebGL in software")]
 
 
 def refine(data: Path, words: list[str]) -> None:
