@@ -20,7 +20,8 @@ setup:
 
 # Tests of what is not there are skipped, with the reason: CUDA needs a GPU; the viewer in a browser needs Chromium
 # (Debian: apt install chromium). Each process has one thread; tests that need more set them.
-PYTEST = BEAGS_REQUIRE_NATIVE=1 OMP_NUM_THREADS=1 "$(BIN)/python" -m pytest -q -n $(JOBS) --dist loadscope --no-loadscope-reorder
+PYTEST = BEAGS_REQUIRE_NATIVE=1 OMP_NUM_THREADS=1 "$(BIN)/python" -m pytest -q -n $(JOBS) --dist loadscope \
+  --no-loadscope-reorder
 
 # Every room, in about eight minutes on two cores.
 test: setup
