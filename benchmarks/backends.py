@@ -1,9 +1,8 @@
-"""Backends to measure over one scene: forward (to images) and backward (to gradients of all inputs)."""
+"""Rasterizers over one scene: forward (to images) and backward (to gradients of all inputs)."""
 
 from __future__ import annotations
 
 import hashlib
-from abc import ABC, abstractmethod
 from dataclasses import asdict
 
 import torch
@@ -17,64 +16,11 @@ from benchmarks.scenes import OUTPUTS, Scene, surfel_inputs
 LEAVES = ("means", "quats", "log_scales", "opacity_logits", "colors", "background")
 
 
-class Backend(ABC):
-    """A differentiable renderer of a scene."""
-
-    @abstractmethod
-    def unavailable(self) -> str | None:
-        """Return None if it can run here, else the reason in a sentence."""
-
-    @abstractmethod
-    def render(self, scene: Scene, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return images by name, rendered from ``leaves`` (``LEAVES`` by name, with gradients)."""
-
-
-class OwnBackend(Backend):
-    """A registered rasterizer, with all its outputs."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def unavailable(self) -> str | None:
-        return RASTERIZERS.get(self.name).unavailable()
-
-    def rasterizer(self) -> Rasterizer:
-        """Return a rasterizer that keeps within a quarter of the memory that is free."""
-        if self.name == "torch":
-            return RASTERIZERS.get("torch")(memory_limit=min(4e9, 0.25 * free_bytes()))
-        return RASTERIZERS.get(self.name)()
-
-    def render(self, scene: Scene, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
-        floats = {name: leaves[name] for name in LEAVES if name != "background"}
-        found = self.rasterizer().rasterize(
-            SurfelInputs(**floats, class_ids=scene.class_ids),
-            scene.camera,
-            scene.settings,
-            leaves["background"],
-            scene.target,
-        )
-        return {name: getattr(found, name) for name in OUTPUTS}
-
-
-class GsplatBackend(Backend):
-    """gsplat's 2DGS functions in torch: colour, alpha and normal only, for they have no more."""
-
-    def unavailable(self) -> str | None:
-        try:
-            from benchmarks import gsplat_torch  # noqa: F401
-        except ImportError as error:
-            return f"gsplat's torch functions are not installed ({error})"
-        return None
-
-    def render(self, scene: Scene, leaves: dict[str, Tensor]) -> dict[str, Tensor]:
-        from benchmarks.gsplat_torch import render
-
-        return render(leaves, scene.camera, scene.settings.near, scene.settings.far)
-
-
-def make_backend(name: str) -> Backend:
-    """Return the backend native, torch or gsplat."""
-    return GsplatBackend() if name == "gsplat" else OwnBackend(name)
+def rasterizer(name: str) -> Rasterizer:
+    """Return a registered rasterizer; the reference keeps within a quarter of the memory that is free."""
+    if name == "torch":
+        return RASTERIZERS.get("torch")(memory_limit=min(4e9, 0.25 * free_bytes()))
+    return RASTERIZERS.get(name)()
 
 
 def make_leaves(scene: Scene) -> dict[str, Tensor]:
@@ -83,16 +29,19 @@ def make_leaves(scene: Scene) -> dict[str, Tensor]:
     return {name: values[name].detach().requires_grad_() for name in LEAVES}
 
 
-def run(backend: Backend, scene: Scene) -> tuple[Seconds, Seconds, dict[str, Tensor], dict[str, Tensor]]:
-    """Run forward and backward; returns the time of each, and images and gradients by name."""
+def run(name: str, scene: Scene) -> tuple[Seconds, Seconds, dict[str, Tensor], dict[str, Tensor]]:
+    """Run forward and backward of a rasterizer; returns the time of each, and images and gradients by name."""
     leaves = make_leaves(scene)
+    floats = {leaf: leaves[leaf] for leaf in LEAVES if leaf != "background"}
+    inputs = SurfelInputs(**floats, class_ids=scene.class_ids)
     start = Seconds.now()
-    images = backend.render(scene, leaves)
+    found = rasterizer(name).rasterize(inputs, scene.camera, scene.settings, leaves["background"], scene.target)
+    images = {output: getattr(found, output) for output in OUTPUTS}
     rendered = Seconds.now()
     loss = _Loss.apply([scene.gradients[name] for name in images], *images.values())
-    found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
+    grads = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
     done = Seconds.now()
-    gradients = {name: g for name, g in zip(leaves, found, strict=True) if g is not None}
+    gradients = {name: g for name, g in zip(leaves, grads, strict=True) if g is not None}
     return rendered - start, done - rendered, images, gradients
 
 

@@ -18,9 +18,9 @@ EMPTY = "1/16x16"  # a step with next to no work: what is left is Python, bindin
 OVERHEAD_SIZE = SIZES[0]
 STEP_SIZE = SIZES[2]
 RASTERIZER_PARTS = ("rasterizer forward", "rasterizer backward")  # of a step: what the rest is compared with
-MEASURED_MEMORY = ("native", "torch", "gsplat", "step")
+MEASURED_MEMORY = ("native", "torch", "step")
 # Cost of a pixel in one layer, forward and backward, relative to the native rasterizer's: for the time left only.
-_COST = {"native": 1.0, "torch": 80.0, "gsplat": 150.0}
+_COST = {"native": 1.0, "torch": 80.0}
 LARGEST_SLOW = 100_000  # surfels; larger cases are for the native rasterizer alone
 
 
@@ -34,7 +34,6 @@ class Options:
     seconds: float  # of a round, for one thing
     budget: float  # seconds of all rounds of one thing
     torch: bool = True
-    gsplat: bool = True
     step: bool = True
     memory: tuple[str, ...] = MEASURED_MEMORY
     torch_large: bool = False
@@ -89,7 +88,7 @@ class Session:
     """The workers of one run: ``best`` has the best instruction set and all backends, ``others`` one more ISA each."""
 
     def __init__(self, stack: ExitStack, options: Options, notes: list[str]) -> None:
-        names = ["native", *(["torch"] if options.torch else []), *(["gsplat"] if options.gsplat else [])]
+        names = ["native", *(["torch"] if options.torch else [])]
         self.best = stack.enter_context(Worker())
         hello = self.best.ask("hello", names=names)
         self.torch_version = hello["torch"]
@@ -112,7 +111,7 @@ class Session:
     def entries(self, size: Size, options: Options, notes: list[str]) -> Iterator[tuple[str, str | None, int]]:
         """Yield (backend, isa, threads) of everything that is timed at a size."""
         for name in self.backends:
-            if name != "native" and size.n > LARGEST_SLOW and not (name == "torch" and options.torch_large):
+            if name == "torch" and size.n > LARGEST_SLOW and not options.torch_large:
                 notes.append(f"not measured: {name} at {size.name}, where a call takes minutes and gigabytes")
                 continue
             for threads in options.threads:
@@ -133,7 +132,7 @@ def work(size: Size) -> float:
 
 def total_work(options: Options) -> float:
     """Return about the sum of the work that ``advance`` gets, for the time left."""
-    kinds = 4 + _COST["torch"] * options.torch + _COST["gsplat"] * options.gsplat
+    kinds = 4 + _COST["torch"] * options.torch
     cases = sum(work(size) * (kinds if size.n <= LARGEST_SLOW else 4) for size in options.sizes)
     return cases * len(options.threads) * 2 + work(options.step_size) * 100 * options.step
 

@@ -16,7 +16,6 @@ from rich.console import Console  # noqa: E402
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn  # noqa: E402
 
 from beags_plugin.system.errors import UserError  # noqa: E402
-from benchmarks.goals import as_json, check_goals  # noqa: E402
 from benchmarks.machine import busy_note, command, commit, describe_machine  # noqa: E402
 from benchmarks.measure import MEASURED_MEMORY, Options, Result, Session, measure_sizes, measure_step, total_work  # noqa: E402
 from benchmarks.report import print_result  # noqa: E402
@@ -27,7 +26,7 @@ QUICK_SIZE = "300/64x48"
 
 @dataclass
 class Arguments:
-    """Measure native, torch reference and gsplat's torch functions in turn, and check the goals; always ends with 0."""
+    """Measure the compiled rasterizer and the torch reference in turn, then whole training steps."""
 
     sizes: tuple[str, ...] = tuple(size.name for size in SIZES)
     """Sizes of 1k 10k 50k 200k, or N/WIDTHxHEIGHT."""
@@ -43,8 +42,6 @@ class Arguments:
     """Measure the torch reference (never at 200k, see torch-large)."""
     torch_large: bool = False
     """Measure the torch reference at 200k too: minutes and gigabytes."""
-    gsplat: bool = True
-    """Measure gsplat's torch functions where they are installed."""
     step: bool = True
     """Measure a whole training step of 50k surfels and the overhead at 1k."""
     memory: bool = True
@@ -59,14 +56,14 @@ class Arguments:
         if self.quick:
             small = parse_size(QUICK_SIZE)
             return Options(
-                [small], list(self.threads), 2, 0.02, 2.0, self.torch, self.gsplat,
+                [small], list(self.threads), 2, 0.02, 2.0, self.torch,
                 self.step, ("native",), step_size=small, overhead_size=small, many_samples=40,
             )  # fmt: skip
         if self.rounds < 1 or not self.threads or min(self.threads) < 1 or not self.sizes:
             raise UserError("at least one size, one round and one thread are needed.")
         return Options(
             [parse_size(size) for size in self.sizes], list(self.threads), self.rounds, self.seconds, self.budget,
-            self.torch, self.gsplat, self.step, MEASURED_MEMORY if self.memory else (), self.torch_large,
+            self.torch, self.step, MEASURED_MEMORY if self.memory else (), self.torch_large,
         )  # fmt: skip
 
 
@@ -94,21 +91,19 @@ def main(arguments: list[str]) -> None:
         measure_sizes(session, options, result, advance)
         if options.step:
             measure_step(session, options, result, advance)
-    goals = check_goals(result, session.isa)
     about = {
         "machine": machine,
         "commit": commit(),
         "command": command(arguments),
         "torch": session.torch_version,
     }
-    print_result(result, goals, about, console)
+    print_result(result, about, console)
     if chosen.json is not None:
         content = {
             **about,
             "rows": result.rows,
             "scenes": result.scenes,
             "step": result.step,
-            "goals": as_json(goals),
             "notes": result.notes,
         }
         chosen.json.write_text(json.dumps(content, indent=1) + "\n")

@@ -7,12 +7,11 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.goals import Goal
 from benchmarks.measure import RASTERIZER_PARTS, Result
 
 
-def print_result(result: Result, goals: list[Goal], about: dict[str, Any], console: Console) -> None:
-    """Print all measurements, then each goal on a line of its own."""
+def print_result(result: Result, about: dict[str, Any], console: Console) -> None:
+    """Print all measurements."""
     machine = about["machine"]
     console.print(
         f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_mb']} MB; torch {about['torch']}; commit "
@@ -21,7 +20,7 @@ def print_result(result: Result, goals: list[Goal], about: dict[str, Any], conso
     )
     console.print(
         "Milliseconds: the least of all calls, in interleaved rounds; in brackets the median. With 1 thread it is CPU "
-        "time, with more wall time. float32, all outputs (gsplat: colour, alpha and normal, all it has).",
+        "time, with more wall time. float32, all outputs.",
         soft_wrap=True,
     )
     _print_rows(result, console)
@@ -30,8 +29,6 @@ def print_result(result: Result, goals: list[Goal], about: dict[str, Any], conso
         _print_step(result.step, console)
     for note in dict.fromkeys(result.notes):
         console.print(note, soft_wrap=True)
-    for goal in goals:
-        console.print(goal.line(), style={True: "green", False: "red", None: "yellow"}[goal.met], soft_wrap=True)
 
 
 def _print_rows(result: Result, console: Console) -> None:
@@ -73,7 +70,7 @@ def _print_rows(result: Result, console: Console) -> None:
 def _print_scenes(result: Result, console: Console) -> None:
     table = Table(title="Scenes and the native rasterizer's work")
     names = ("size", "median width, px", "layers per pixel", "lanes", "contributing", "lanes per pair")
-    for name in (*names, "tile pairs", "of box pairs", "projection + binning"):
+    for name in (*names, "tile pairs", "of box pairs", "projection + binning", "same bits"):
         table.add_column(name, justify="left" if name == "size" else "right")
     for scene in result.scenes:
         work = scene.get("work")
@@ -90,8 +87,9 @@ def _print_scenes(result: Result, console: Console) -> None:
             ]
         first = scene.get("projection_binning_ms")
         table.add_row(
-            scene["size"], f"{scene['median_width']:.1f}", *counts, "-" if first is None else f"{_ms(first)} ms"
-        )
+            scene["size"], f"{scene['median_width']:.1f}", *counts, "-" if first is None else f"{_ms(first)} ms",
+            {True: "yes", False: "NO", None: "-"}[scene.get("same_bits")],
+        )  # fmt: skip
     console.print(table)
 
 

@@ -84,14 +84,14 @@ def _hello(names: list[str]) -> dict[str, Any]:
     """Return what this process can measure: instruction sets, and per backend None or the reason that it cannot run."""
     import torch
 
-    from beags_plugin.rasterizers import native
+    from beags_plugin.rasterizers import RASTERIZERS, native
     from benchmarks import backends
 
-    reasons = {name: backends.make_backend(name).unavailable() for name in names}
+    reasons = {name: RASTERIZERS.get(name).unavailable() for name in names}
     known = reasons.get("native", "") is None
     for name, reason in reasons.items():
         if reason is None:
-            backends.run(backends.make_backend(name), _scene(SMALL))  # what a process pays once
+            backends.run(name, _scene(SMALL))  # what a process pays once
     return {
         "torch": torch.__version__,
         "reasons": reasons,
@@ -105,10 +105,10 @@ def _time(size: str, backend: str, threads: int, seconds: float) -> dict[str, Ti
     from benchmarks import backends
 
     _set_threads(threads)
-    made, scene = backends.make_backend(backend), _scene(size)
+    scene = _scene(size)
     found: dict[str, Timings] = {"forward": [], "backward": []}
     for _ in _calls(seconds):
-        forward, backward, _, _ = backends.run(made, scene)
+        forward, backward, _, _ = backends.run(backend, scene)
         found["forward"].append(forward.ms())
         found["backward"].append(backward.ms())
     return found
@@ -148,7 +148,7 @@ def _digest(size: str, threads: int) -> str:
     from benchmarks import backends
 
     _set_threads(threads)
-    _, _, images, gradients = backends.run(backends.make_backend("native"), _scene(size))
+    _, _, images, gradients = backends.run("native", _scene(size))
     return backends.digest(*images.values(), *gradients.values())
 
 
@@ -176,9 +176,9 @@ def _peak(size: str, threads: int, backend: str | None = None, samples: int | No
         step = _training_step(size, samples)
         step.run()  # Adam's moments are the scene's, not the step's
         return peak_mb_of(step.run)
-    made, scene = backends.make_backend(backend), _scene(size)
-    backends.run(made, _scene(SMALL))
-    return peak_mb_of(lambda: backends.run(made, scene))
+    scene = _scene(size)
+    backends.run(backend, _scene(SMALL))
+    return peak_mb_of(lambda: backends.run(backend, scene))
 
 
 def _calls(seconds: float):

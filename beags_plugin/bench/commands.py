@@ -63,14 +63,11 @@ SHIPPED = {
     "all.",
     "sensitivity": "How much the result depends on k (neighbours that set the voxel size) and Z (samples per "
     "Gaussian).",
-    "depth": "How much refinement needs of the base's depth: bases trained with and without depth and normal terms.",
     "masks": "How much damage to the masks costs, with and without reprojection.",
-    "tradeoff": "What time and memory buy: every choice moved alone, and the Pareto front of cost and quality.",
     "presets": "What the refinements of the presets cost and give, from one base.",
     "compare": "The paper's twelve other methods beside this one, from one base, on identical masks.",
     "compare-consistent": "The same with the consistent masks of this method for all.",
     "classes": "How time and memory of each method grow with the number of classes.",
-    "refinement": "What each part of our refinement gives beside the paper's losses, on larger scenes.",
 }
 """Commands by experiment, with the sentence of their help."""
 

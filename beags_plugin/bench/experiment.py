@@ -15,7 +15,7 @@ from beags_plugin.system.shipped import read_toml, shipped_folder, shipped_names
 PHASES = ("base", "refine", "both")
 DAMAGE, CLASSES = "damage", "classes"  # axes that are no config keys: the degree of mask damage, a number of objects
 _ENTRIES = {
-    "description", "preset", "seeds", "sample", "variant", "sweep", "paper", "reference", "confidence", "front",
+    "description", "preset", "seeds", "sample", "variant", "sweep", "paper", "reference", "confidence",
     "objects", *PHASES,
 }  # fmt: skip
 _VARIANT = {"name", DAMAGE, "per_object", "preset", "control", *PHASES}
@@ -67,8 +67,8 @@ class Experiment:
 
     samples, sample: family and seed of the generated scenes, and other options of ``SampleConfig``. of_seed: such
     options of the scenes of one seed alone. seeds: of the training.
-    reference: the variant that the others' errors are compared with. confidence, front, objects: also plot the masks'
-    confidence, the Pareto front, or the largest objects by each variant. relative_to_pixels: sweeps whose axis is also
+    reference: the variant that the others' errors are compared with. confidence, objects: also plot the masks'
+    confidence, or the largest objects by each variant. relative_to_pixels: sweeps whose axis is also
     given per million training pixels.
     """
 
@@ -81,7 +81,6 @@ class Experiment:
     variants: tuple[Variant, ...]
     reference: str | None = None
     confidence: bool = False
-    front: bool = False
     objects: bool = False
     relative_to_pixels: frozenset[str] = frozenset()
     paper: PaperFigures | None = None
@@ -175,7 +174,6 @@ class _Reader:
             variants=tuple(variants),
             reference=reference,
             confidence=self.value(content, "confidence", bool, False),
-            front=self.value(content, "front", bool, False),
             objects=self.value(content, "objects", bool, False),
             relative_to_pixels=frozenset(s["name"] for s in sweeps if s.get("relative_to_pixels")),
             paper=self.paper(),

@@ -41,7 +41,6 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
     ``UserError`` for a mistake in the experiment or the options. A trial that fails is a row with the reason.
     """
     from beags_plugin.bench.confidence import plot_confidence
-    from beags_plugin.bench.front import plot_front
     from beags_plugin.bench.objects_picture import plot_objects
     from beags_plugin.bench.pictures import plot_experiment
     from beags_plugin.bench.tables import tables
@@ -81,9 +80,6 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
     if experiment.objects:
         paths = plot_objects(picture.with_stem(f"{picture.stem}-objects"), runs, outcomes)
         files |= {f"objects {place}" if place > 1 else "objects": path for place, path in enumerate(paths, start=1)}
-    if experiment.front:
-        files["front"] = picture.with_stem(f"{picture.stem}-front")
-        plot_front(files["front"], experiment, rows)
     for kind, path in files.items():
         CONSOLE.print(f"{kind}: {path}")
     return rows

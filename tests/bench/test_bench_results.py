@@ -17,7 +17,6 @@ from experiment_files import GOOD, masks_of, scene, written
 
 from beags_plugin.bench.engines.interface import Outcome
 from beags_plugin.bench.experiment import Variant, load_experiment
-from beags_plugin.bench.front import pareto_front, plot_front
 from beags_plugin.bench.pictures import plot_experiment
 from beags_plugin.bench.report import write_csv, write_json
 from beags_plugin.bench.results import (
@@ -187,22 +186,6 @@ def test_a_sweep_has_a_sentence_of_its_memory_and_an_axis_per_pixels(rows, exper
     assert per_million_pixels(rows[0], experiment) == "–"
     assert memory_line(means(rows), "k") == "Along k the peak memory moves from 900 to 900 MB (own: 100 to 100)."
     assert memory_line(means(rows[3:]), "k") is None
-
-
-def test_the_front_is_what_nothing_beats(tmp_path):
-    points = [tuple(point) for point in np.random.default_rng(0).integers(0, 6, (40, 2)).tolist()]
-    rows = [
-        ResultRow(Variant(str(i)), "a", 0, {**dict.fromkeys(FIGURES), "cpu_seconds total": x, "psnr_after": y}, {})
-        for i, (x, y) in enumerate(points)
-    ]
-    rows.append(ResultRow(Variant("unknown"), "a", 0, dict.fromkeys(FIGURES), {}))
-    found = {row.variant.name for row in pareto_front(rows, "cpu_seconds total", "psnr_after")}
-    better = {
-        (x, y): any(c <= x and q >= y and (c, q) != (x, y) for c, q in points) for x, y in points
-    }  # by definition, pair by pair
-    assert found == {str(i) for i, point in enumerate(points) if not better[point]}
-    plot_front(tmp_path / "front.png", load_experiment("ablation"), rows)
-    assert (tmp_path / "front.png").stat().st_size > 10_000
 
 
 def test_the_plot_has_failures_or_none(rows, tmp_path):
