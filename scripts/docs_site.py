@@ -38,7 +38,7 @@ INTERFACES = {  # by entry-point group
     "beags.mask_sources": "beags_plugin.masks.sources.base",
     "beags.exporters": "beags_plugin.export.base",
     "beags.importers": "beags_plugin.importers.base",
-    "beags.engines": "beags_plugin.bench.engines.interface",
+    "beags.engines": "beags_benchmarks.experiments.engines.interface",
 }
 
 

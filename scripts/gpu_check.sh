@@ -61,14 +61,14 @@ sanitized() { # a tool of compute-sanitizer on a small scene, three minutes at m
     return 77
   }
   PYTORCH_NO_CUDA_MEMORY_CACHING=1 timeout --kill-after 10 170 compute-sanitizer --tool "$1" --error-exitcode 9 \
-    "$python" -m benchmarks.cuda --smoke
+    "$python" -m beags_benchmarks.studies.cuda --smoke
 }
 memcheck() { sanitized memcheck; }
 racecheck() { sanitized racecheck; }
 synccheck() { sanitized synccheck; }
 
 benchmark() {
-  "$python" -m benchmarks.cuda --json "$out/cuda.json" --seconds "${BENCHMARK_SECONDS:-500}" \
+  "$python" -m beags_benchmarks.studies.cuda --json "$out/cuda.json" --seconds "${BENCHMARK_SECONDS:-500}" \
     --gsplat-seconds "${GSPLAT_SECONDS:-150}"
 }
 

@@ -35,7 +35,7 @@ sys.path[:0] = [str(ROOT), str(Path(__file__).resolve().parent)]
 import forked  # noqa: E402
 import same_bits  # noqa: E402
 
-from beags_plugin.bench.provenance import commit, describe_machine  # noqa: E402
+from beags_benchmarks.provenance import commit, describe_machine  # noqa: E402
 
 OPTIONS = {
     "pipeline.model.base_steps": 80, "pipeline.model.refine_steps": 30,
