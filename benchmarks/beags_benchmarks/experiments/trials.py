@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib.metadata import entry_points
+from importlib.metadata import distributions
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ OPTIONS = MODEL + "refiner_options"
 def code_of_trials() -> str:
     """Digest all code that decides a trial's result: beags, packages that extend it, and what measures here."""
     measure = Path(__file__).with_name("measure.py")
-    points = (point for point in entry_points() if point.group.startswith("beags."))
+    points = (point for each in distributions() for point in each.entry_points if point.group.startswith("beags."))
     packages = {point.value.partition(":")[0].partition(".")[0] for point in points} - {__name__.partition(".")[0]}
     files = [measure]
     for name in sorted(packages):

@@ -5,6 +5,7 @@ It is drawn from the files of docs/results that README's table is made from, and
 
 from __future__ import annotations
 
+import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -50,4 +51,5 @@ def draw(root: Path = ROOT) -> Path:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     print(draw())

@@ -6,12 +6,13 @@ scenes, which are exact) that mesh and splats both cover, its mean over views; c
 that the mesh covers. Chamfer is the mean of the two mean distances between mesh and exact surface, the underside too,
 in per cent of the object's longest side; it is not a number for captures, whose shapes nobody knows.
 
-With ``--one-colour`` before RUN: PSNR of the splats alone, as they are and with one colour from all sides, which is
+With ``--one-colour``: PSNR of the splats alone, as they are and with one colour from all sides, which is
 what any texture can be compared with where the photos' colours change with the view.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 import tempfile
@@ -281,19 +282,18 @@ def formatted(row) -> str:
 
 def main() -> None:
     """Measure objects of the run that is named."""
-    arguments = sys.argv[1:]
-    if one_colour := arguments[:1] == ["--one-colour"]:
-        del arguments[0]
-    if not arguments:
-        sys.exit(__doc__)
-    path = Path(arguments[0])
-    path = path if path.is_file() else path / "config.yml"
-    if one_colour:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("objects", nargs="*", metavar="OBJECT")
+    parser.add_argument("--one-colour", action="store_true")
+    options = parser.parse_args()
+    path = options.run if options.run.is_file() else options.run / "config.yml"
+    if options.one_colour:
         print("| scene, object | splats' PSNR | with one colour from all sides |\n| --- | --- | --- |", flush=True)
-        return measure_one_colour(path, arguments[1:])
+        return measure_one_colour(path, options.objects)
     print("| scene, object | mesh | splats' PSNR | its PSNR | covered % | chamfer % | closed % | triangles | MB |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |", flush=True)
-    measure(path, arguments[1:])
+    measure(path, options.objects)
 
 
 if __name__ == "__main__":

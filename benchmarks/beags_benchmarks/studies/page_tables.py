@@ -7,6 +7,7 @@ there, which are the only source of its figures.
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 import sys
@@ -228,8 +229,10 @@ def write_tables(root: Path = ROOT) -> None:
 
 
 def main(arguments: Sequence[str], root: Path = ROOT) -> None:
-    """Reduce the named results into docs/results, FILE or NAME=FILE, and write all tables."""
-    for argument in arguments:
+    """Reduce the named results into docs/results, and write all tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("results", nargs="*", metavar="[NAME=]FILE", help="NAME: of the file in docs/results")
+    for argument in parser.parse_args(arguments).results:
         name, _, file = argument.rpartition("=")
         path = Path(file)
         report = json.loads(path.read_text())

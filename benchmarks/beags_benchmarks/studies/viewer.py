@@ -25,8 +25,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, cast
 
+from beags_benchmarks.kernels.scenes import Size, make_scene
 from beags_benchmarks.provenance import busy_note, describe_machine
-from beags_benchmarks.studies.scenes import Size, make_scene
 
 MOVES_PER_SECOND = 50  # what viser's page sends at most
 SETTLING = 4.0  # seconds of moving before the figures count

@@ -152,4 +152,4 @@ def test_the_file_in_the_documentation_is_an_experiment(tmp_path):
     path = written(tmp_path, "\n".join(line.strip() for line in block.splitlines()))
     found = load_experiment(path)
     assert [variant.name for variant in found.variants][:2] == ["as it is", "worse masks"]
-    assert found.variants[1].damage == 2.0 and found.front and found.confidence and len(found.variants) == 5
+    assert found.variants[1].damage == 2.0 and found.confidence and len(found.variants) == 5

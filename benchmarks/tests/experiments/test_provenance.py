@@ -15,7 +15,7 @@ from beags_benchmarks.provenance import command
         (None, "beags"),
         ("beags_plugin.commands.cli", "beags"),
         ("beags_benchmarks.studies.page_tables", "python -m beags_benchmarks.studies.page_tables"),
-        ("beags_benchmarks.studies.__main__", "python -m benchmarks"),
+        ("beags_benchmarks.__main__", "python -m beags_benchmarks"),
     ],
 )
 def test_a_measurement_names_the_command_that_was_typed(module, program, monkeypatch):

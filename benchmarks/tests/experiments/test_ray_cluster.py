@@ -1,6 +1,6 @@
 """A Ray cluster of three nodes on this machine runs a sweep, and loses what can be lost on the way.
 
-Slow, and skipped where Ray is missing: pip install 'beags[ray]'.
+Slow, and skipped where Ray is missing: pip install './benchmarks[ray]'.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import psutil
 import pytest
 
 pytest.importorskip("nerfstudio")
-ray = pytest.importorskip("ray", reason="Ray is missing: pip install 'beags[ray]'")
+ray = pytest.importorskip("ray", reason="Ray is missing: pip install './benchmarks[ray]'")
 if sys.platform != "linux":
     pytest.skip("processes are looked for in /proc, and end with those that started them", allow_module_level=True)
 

@@ -12,8 +12,8 @@ import pytest
 from cuda_backends import EmulatedCudaRasterizer
 from places import ROOT
 
-from beags_benchmarks.studies import cuda
-from beags_benchmarks.studies.scenes import Size
+from beags_benchmarks.kernels import cuda
+from beags_benchmarks.kernels.scenes import Size
 from beags_plugin.ops import extension
 
 SCRIPT = ROOT / "scripts" / "gpu_check.sh"

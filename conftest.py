@@ -27,7 +27,7 @@ def pytest_sessionstart(session):
 
 LONG = {  # files that take minutes: begun first, so that no process waits for them at the end
     "tests/commands/test_end_to_end.py", "tests/commands/test_readme_commands.py", "tests/test_wheel.py",
-    "tests/bench/test_ray_cluster.py", "tests/plugin/viewer/test_viewer_browser.py",
+    "benchmarks/tests/experiments/test_ray_cluster.py", "tests/plugin/viewer/test_viewer_browser.py",
     "tests/plugin/viewer/test_viewer_browser_runs.py",
 }  # fmt: skip
 SPREAD = {

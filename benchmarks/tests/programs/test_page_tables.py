@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import pytest
 from places import ROOT
@@ -42,6 +43,17 @@ def test_a_page_has_the_figures_of_the_committed_files(table):
             (row,) = (row for row in sources[file]["rows"] if (row["variant"], row["scene"]) == (name, scene))
             values = [f"{factor * row[figure]:.{digits}f}" for figure, digits, factor in table.figures]
             assert cell == ", ".join(values)
+
+
+def test_the_committed_pages_are_what_the_program_writes(tmp_path):
+    pages = {table.page for table in page_tables.TABLES}
+    for page in pages:
+        (tmp_path / page).parent.mkdir(exist_ok=True)
+        (tmp_path / page).write_text((ROOT / page).read_text())
+    shutil.copytree(RESULTS, tmp_path / "docs/results")
+    page_tables.main([], tmp_path)
+    for page in pages:
+        assert (tmp_path / page).read_text() == (ROOT / page).read_text(), page
 
 
 def objects_of(place: int, figures: dict) -> dict[str, dict]:

@@ -1,6 +1,6 @@
 """Measure the CUDA backend on a GPU, beside gsplat's 2DGS where it is installed.
 
-    python -m beags_benchmarks.studies.cuda [--quick | --smoke] [--json FILE] [--seconds 500] [--gsplat-seconds 150]
+    python -m beags_benchmarks.kernels.cuda [--quick | --smoke] [--json FILE] [--seconds 500] [--gsplat-seconds 150]
 
 Figures are medians of CUDA events around whole calls, after warming up. What does not fit into --seconds is left out
 and named. See notes/speed.md.
@@ -21,10 +21,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from beags_benchmarks.kernels.cuda_smoke import LEAVES, smoke
+from beags_benchmarks.kernels.scenes import Scene, Size, make_scene, on_device
+from beags_benchmarks.kernels.training_step import TrainingStep
 from beags_benchmarks.provenance import commit, describe_machine
-from beags_benchmarks.studies.cuda_smoke import LEAVES, smoke
-from beags_benchmarks.studies.scenes import Scene, Size, make_scene, on_device
-from beags_benchmarks.studies.training_step import TrainingStep
 from beags_plugin.rasterizers.cuda import CudaRasterizer
 from beags_plugin.rasterizers.interface import SurfelInputs
 
@@ -241,7 +241,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--gsplat-seconds", type=float, default=150.0, help="for gsplat to compile; 0 leaves it out")
     chosen, began = parser.parse_args(arguments), time.monotonic()
     if reason := CudaRasterizer.unavailable():
-        print(f"beags_benchmarks.studies.cuda: {reason}", file=sys.stderr)
+        print(f"beags_benchmarks.kernels.cuda: {reason}", file=sys.stderr)
         return 1
     if chosen.smoke:
         wrong = smoke(CudaRasterizer())

@@ -1,4 +1,4 @@
-"""Measure the rasterizers and a whole training step: python -m beags_benchmarks.studies.rasterizer --help."""
+"""Measure the rasterizers and a whole training step: python -m beags_benchmarks.kernels.rasterizer --help."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from beags_benchmarks.provenance import busy_note, command, commit, describe_machine
-from beags_benchmarks.studies.measure import (
+from beags_benchmarks.kernels.measure import (
     MEASURED_MEMORY,
     Options,
     Result,
@@ -22,8 +21,9 @@ from beags_benchmarks.studies.measure import (
     measure_step,
     total_work,
 )
-from beags_benchmarks.studies.report import print_result
-from beags_benchmarks.studies.scenes import SIZES, parse_size
+from beags_benchmarks.kernels.report import print_result
+from beags_benchmarks.kernels.scenes import SIZES, parse_size
+from beags_benchmarks.provenance import busy_note, command, commit, describe_machine
 from beags_plugin.system.errors import UserError
 
 QUICK_SIZE = "300/64x48"

@@ -9,8 +9,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
 
-from beags_benchmarks.studies.scenes import SIZES, Size
-from beags_benchmarks.studies.worker import Worker
+from beags_benchmarks.kernels.scenes import SIZES, Size
+from beags_benchmarks.kernels.worker import Worker
 
 REFINEMENT_SAMPLES = 20  # Z of the preset
 MANY_SAMPLES = 1000

@@ -8,8 +8,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from beags_benchmarks.studies.scenes import CLASSES, Scene, Size, make_scene, on_device
-from beags_benchmarks.studies.training_step import visibility_grid
+from beags_benchmarks.kernels.scenes import CLASSES, Scene, Size, make_scene, on_device
+from beags_benchmarks.kernels.training_step import visibility_grid
 from beags_plugin.masks.reprojection import reproject_pairwise
 from beags_plugin.masks.voxel_reprojection import reproject_voxel
 from beags_plugin.occupancy.grid import VisibilityGrid

@@ -7,7 +7,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from beags_benchmarks.studies.measure import RASTERIZER_PARTS, Result
+from beags_benchmarks.kernels.measure import RASTERIZER_PARTS, Result
 
 
 def print_result(result: Result, about: dict[str, Any], console: Console) -> None:

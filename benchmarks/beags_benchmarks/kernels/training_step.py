@@ -7,8 +7,8 @@ from functools import reduce
 
 import torch
 
-from beags_benchmarks.studies.clock import Seconds
-from beags_benchmarks.studies.scenes import CLASSES, Scene
+from beags_benchmarks.kernels.clock import Seconds
+from beags_benchmarks.kernels.scenes import CLASSES, Scene
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.base import Loss, LossInputs
 from beags_plugin.losses.boundary import BoundaryLoss

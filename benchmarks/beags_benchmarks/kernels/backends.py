@@ -8,8 +8,8 @@ from dataclasses import asdict
 import torch
 from torch import Tensor
 
-from beags_benchmarks.studies.clock import Seconds
-from beags_benchmarks.studies.scenes import OUTPUTS, Scene, surfel_inputs
+from beags_benchmarks.kernels.clock import Seconds
+from beags_benchmarks.kernels.scenes import OUTPUTS, Scene, surfel_inputs
 from beags_plugin.rasterizers import RASTERIZERS, native
 from beags_plugin.rasterizers.interface import Rasterizer, SurfelInputs
 

@@ -34,7 +34,7 @@ class Worker:
         if isa is not None:
             environment["BEAGS_ISA"] = isa
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "beags_benchmarks.studies.worker"],
+            [sys.executable, "-m", "beags_benchmarks.kernels.worker"],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment,
         )  # fmt: skip
 
@@ -84,7 +84,7 @@ def _hello(names: list[str]) -> dict[str, Any]:
     """Return what this process can measure: instruction sets, and per backend None or the reason that it cannot run."""
     import torch
 
-    from beags_benchmarks.studies import backends
+    from beags_benchmarks.kernels import backends
     from beags_plugin.rasterizers import RASTERIZERS, native
 
     reasons = {name: RASTERIZERS.get(name).unavailable() for name in names}
@@ -102,7 +102,7 @@ def _hello(names: list[str]) -> dict[str, Any]:
 
 def _time(size: str, backend: str, threads: int, seconds: float) -> dict[str, Timings]:
     """Measure forward and backward, call by call, for about ``seconds`` and at least once."""
-    from beags_benchmarks.studies import backends
+    from beags_benchmarks.kernels import backends
 
     _set_threads(threads)
     scene = _scene(size)
@@ -116,8 +116,8 @@ def _time(size: str, backend: str, threads: int, seconds: float) -> dict[str, Ti
 
 def _stages(size: str, threads: int, seconds: float) -> Timings:
     """Measure the native forward's first stage alone: projection and binning."""
-    from beags_benchmarks.studies import backends
-    from beags_benchmarks.studies.clock import Seconds
+    from beags_benchmarks.kernels import backends
+    from beags_benchmarks.kernels.clock import Seconds
     from beags_plugin.rasterizers import native
 
     _set_threads(threads)
@@ -145,7 +145,7 @@ def _step(
 
 def _digest(size: str, threads: int) -> str:
     """Return a hash of all images and gradients of the native rasterizer."""
-    from beags_benchmarks.studies import backends
+    from beags_benchmarks.kernels import backends
 
     _set_threads(threads)
     _, _, images, gradients = backends.run("native", _scene(size))
@@ -154,7 +154,7 @@ def _digest(size: str, threads: int) -> str:
 
 def _describe(size: str) -> dict[str, Any]:
     """Return the median width of the scene's surfels in pixels, and the native rasterizer's work, or None."""
-    from beags_benchmarks.studies import backends, scenes
+    from beags_benchmarks.kernels import backends, scenes
 
     scene = _scene(size)
     return {"median_width": scenes.median_width(scene), "work": backends.work_counts(scene)}
@@ -166,9 +166,9 @@ def _sampled(size: str) -> float:
 
 def _peak(size: str, threads: int, backend: str | None = None, samples: int | None = None) -> float:
     """Return the MB of a forward and backward (without a backend: a training step) beyond scene and libraries."""
-    from beags_benchmarks.studies import backends
-    from beags_benchmarks.studies.peak_memory import peak_mb_of
-    from beags_benchmarks.studies.training_step import TrainingStep
+    from beags_benchmarks.kernels import backends
+    from beags_benchmarks.kernels.peak_memory import peak_mb_of
+    from beags_benchmarks.kernels.training_step import TrainingStep
 
     _set_threads(threads)
     if backend is None:
@@ -199,14 +199,14 @@ def _set_threads(threads: int) -> None:
 
 @lru_cache(maxsize=8)
 def _scene(size: str):
-    from beags_benchmarks.studies.scenes import make_scene, parse_size
+    from beags_benchmarks.kernels.scenes import make_scene, parse_size
 
     return make_scene(parse_size(size))
 
 
 @lru_cache(maxsize=8)
 def _training_step(size: str, samples: int | None):
-    from beags_benchmarks.studies.training_step import TrainingStep
+    from beags_benchmarks.kernels.training_step import TrainingStep
 
     return TrainingStep(_scene(size), samples)
 
