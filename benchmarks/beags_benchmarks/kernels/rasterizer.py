@@ -96,21 +96,10 @@ def main(arguments: list[str]) -> None:
         measure_sizes(session, options, result, advance)
         if options.step:
             measure_step(session, options, result, advance)
-    about = {
-        "machine": machine,
-        "commit": commit(),
-        "command": command(),
-        "torch": session.torch_version,
-    }
+    about = {"machine": machine, "commit": commit(), "command": command(), "torch": session.torch_version}
     print_result(result, about, console)
     if chosen.json is not None:
-        content = {
-            **about,
-            "rows": result.rows,
-            "scenes": result.scenes,
-            "step": result.step,
-            "notes": result.notes,
-        }
+        content = {**about, "rows": result.rows, "scenes": result.scenes, "step": result.step, "notes": result.notes}
         chosen.json.write_text(json.dumps(content, indent=1) + "\n")
         console.print(f"written: {chosen.json}")
 

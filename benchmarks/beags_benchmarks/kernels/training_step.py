@@ -24,22 +24,7 @@ VOXELS_PER_SPACING = 0.6  # voxel size over the mean spacing of the surfels: a f
 _OUTPUTS = ("color", "alpha", "depth", "normal", "boundary")  # inputs of the losses
 
 
-class Training:
-    """Gaussians as parameters of Adam. step: number of steps so far."""
-
-    def __init__(self, surfels: Surfels, rate: float) -> None:
-        values = {field.name: getattr(surfels, field.name) for field in fields(Surfels)}
-        self.parameters = {name: torch.nn.Parameter(value.clone().contiguous()) for name, value in values.items()}
-        groups = [{"params": [value]} for value in self.parameters.values()]
-        self.adam = torch.optim.Adam(groups, lr=rate, eps=1e-15, fused=True)
-        self.step = 0
-
-    def surfels(self) -> Surfels:
-        """Return the parameters as Gaussians."""
-        return Surfels(**self.parameters)
-
-
-class TrainingStep(Training):
+class TrainingStep:
     """The step of the preset ``beags-paper`` on one scene: L1 + SSIM and normal losses; in refinement two more.
 
     samples: Z of the occupancy loss, in a refinement step with boundary and occupancy losses; None: a base step.
@@ -47,7 +32,11 @@ class TrainingStep(Training):
     """
 
     def __init__(self, scene: Scene, samples: int | None = None, rasterizer: Rasterizer | None = None) -> None:
-        super().__init__(scene.surfels, rate=0.0)  # all the work of a step, and every step the same
+        surfels = {field.name: getattr(scene.surfels, field.name) for field in fields(Surfels)}
+        self.parameters = {name: torch.nn.Parameter(value.clone().contiguous()) for name, value in surfels.items()}
+        groups = [{"params": [value]} for value in self.parameters.values()]
+        self.adam = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)  # all the work, and every step the same
+        self.step = 0
         self.scene = scene
         self.rasterizer = rasterizer or make_rasterizer("auto")
         self.settings = replace(scene.settings, distortion=False)  # the preset's weight of the distortion is 0
@@ -63,7 +52,7 @@ class TrainingStep(Training):
         """Run a step; returns its time."""
         start = Seconds.now()
         self.adam.zero_grad()
-        surfels = self.surfels()
+        surfels = Surfels(**self.parameters)
         class_ids = self.scene.class_ids if self.refining else None
         render = self._rasterize(surfel_inputs(surfels, self.scene.camera, class_ids=class_ids))
         inputs = self._loss_inputs(surfels, render)
@@ -84,7 +73,7 @@ class TrainingStep(Training):
             clock = Seconds.now()
 
         self.adam.zero_grad()
-        surfels = self.surfels()
+        surfels = Surfels(**self.parameters)
         class_ids = self.scene.class_ids if self.refining else None
         inputs = surfel_inputs(surfels, self.scene.camera, class_ids=class_ids)
         stop("SH colours")

@@ -95,16 +95,7 @@ TABLES: tuple[PageTable, ...] = (
         "docs/results.md",
         "trade-off",
         {"digger, 260 pixels": ("trade-off-kitchen", DIGGER)},
-        (
-            "200 steps (beags-fast)",
-            "50 steps",
-            "800 steps",
-            "k / 8",
-            "k x 8",
-            "Z = 5",
-            "Z = 100",
-            "no reprojection",
-        ),
+        ("200 steps (beags-fast)", "50 steps", "800 steps", "k / 8", "k x 8", "Z = 5", "Z = 100", "no reprojection"),
         (BIOU, SPILL, FITTED, SECONDS),
     ),
     PageTable(

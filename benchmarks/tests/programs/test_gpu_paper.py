@@ -12,6 +12,7 @@ SCRIPT = ROOT / "scripts" / "gpu_paper.sh"
 PYTHON = """#!/bin/bash
 case "$*" in
   *"import nerfstudio"*) exit {nerfstudio} ;;
+  *"import beags_benchmarks"*) exit {bench} ;;
   *CudaRasterizer*) echo "{reason}"; exit 0 ;;
 esac
 printf '%s\\n' "$@" > "{folder}/called-$(basename "${{@: -1}}")-$$"
@@ -20,12 +21,14 @@ exit {code}
 """
 
 
-def called(tmp_path: Path, *arguments: str, nerfstudio: int = 0, reason: str = "", code: int = 0):
+def called(tmp_path: Path, *arguments: str, nerfstudio: int = 0, bench: int = 0, reason: str = "", code: int = 0):
     """Run the script beside programs that pretend to be a GPU's and Python."""
     bins = tmp_path / "bin"
     bins.mkdir()
     (bins / "nvidia-smi").write_text("#!/bin/sh\necho GPU 0\n")
-    (bins / "python3").write_text(PYTHON.format(nerfstudio=nerfstudio, reason=reason, folder=tmp_path, code=code))
+    (bins / "python3").write_text(
+        PYTHON.format(nerfstudio=nerfstudio, bench=bench, reason=reason, folder=tmp_path, code=code)
+    )
     for file in bins.iterdir():
         file.chmod(0o755)
     return subprocess.run(
@@ -59,6 +62,7 @@ def test_each_capture_is_trained_by_the_papers_preset(tmp_path, data):
     ("change", "words"),
     [
         ({"nerfstudio": 1}, "has no nerfstudio: install"),
+        ({"bench": 1}, "has no beags bench: call"),
         ({"reason": "no CUDA build"}, "gpu_paper: no CUDA build"),
         ({"code": 3}, "not done: fruit garden; the logs are in"),
         ({"code": 124}, "fruit (out of time: call again to go on)"),
