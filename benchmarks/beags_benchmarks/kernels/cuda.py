@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -102,7 +102,7 @@ class Rendering:
 class GsplatRendering(Rendering):
     """gsplat's ``rasterization_2dgs``: colour with expected depth, alpha, normal, and normals of that depth."""
 
-    mode = "RGB+ED"
+    mode: Literal["RGB", "RGB+ED"] = "RGB+ED"
 
     def images(self) -> dict[str, Tensor]:
         from gsplat.rendering import rasterization_2dgs

@@ -33,18 +33,8 @@ def print_result(result: Result, about: dict[str, Any], console: Console) -> Non
 
 def _print_rows(result: Result, console: Console) -> None:
     table = Table(title="Rasterizers")
-    for name in (
-        "size",
-        "backend",
-        "isa",
-        "threads",
-        "forward",
-        "backward",
-        "wall, both",
-        "calls",
-        "to torch",
-        "peak MB",
-    ):
+    names = ("size", "backend", "isa", "threads", "forward", "backward", "wall, both", "calls", "to torch", "peak MB")
+    for name in names:
         table.add_column(name, justify="left" if name in ("size", "backend", "isa") else "right")
     previous = None
     for row in result.rows:

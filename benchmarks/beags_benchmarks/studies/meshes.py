@@ -73,7 +73,10 @@ class Drawn:
             return np.einsum("pc,pcd->pd", weights, values[self.faces[face]])
 
         colors = np.zeros((len(there), 3))
-        colors[there] = at(self.colors) if self.uv is None else looked_up(self.image, at(self.uv))
+        if self.uv is not None and self.image is not None:
+            colors[there] = looked_up(self.image, at(self.uv))
+        elif self.colors is not None:
+            colors[there] = at(self.colors)
         shape = (camera.height, 2, camera.width, 2)
         return colors.reshape(*shape, 3).mean(axis=(1, 3)), there.reshape(shape).all(axis=(1, 3))
 
@@ -137,14 +140,13 @@ def chamfer(mesh: Drawn, exact: np.ndarray) -> float:
     """Return the mean of both mean distances, in per cent of the longest side of the exact points [P, 3]."""
     import open3d
     import trimesh
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     side = np.ptp(exact, axis=0).max()
     there = mesh.caster(mesh.places).compute_distance(open3d.core.Tensor(exact.astype(np.float32))).numpy()
-    points, _ = trimesh.sample.sample_surface(
-        trimesh.Trimesh(mesh.places, mesh.faces, process=False), DISTANCES, seed=0
-    )
-    back, _ = cKDTree(exact).query(np.asarray(points))
+    surface = trimesh.Trimesh(mesh.places, mesh.faces, process=False)
+    points = trimesh.sample.sample_surface(surface, DISTANCES, seed=0)[0]
+    back, _ = KDTree(exact).query(np.asarray(points))
     return float(100 * (there.mean() + back.mean()) / 2 / side)
 
 
