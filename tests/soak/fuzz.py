@@ -29,10 +29,11 @@ from pathlib import Path
 from unittest.mock import patch
 
 import torch
-from degenerate import FLOATS, Scene, degenerate_scene
 from torch import Tensor
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parent)]
+from degenerate import FLOATS, Scene, degenerate_scene  # noqa: E402
+
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.occupancy import OccupancyLoss

@@ -12,8 +12,7 @@ from beags_benchmarks.experiments.scenes import SEEDS
 from beags_plugin.system.errors import UserError, check_choice, meant
 from beags_plugin.system.shipped import read_toml
 
-FILES = Path(__file__).parent / "files"
-"""Folder of the experiments that come with this package."""
+FILES = Path(__file__).parent / "files"  # the experiments that come with this package
 PHASES = ("base", "refine", "both")
 DAMAGE, CLASSES = "damage", "classes"  # axes that are no config keys: the degree of mask damage, a number of objects
 _ENTRIES = {

@@ -21,10 +21,9 @@ OPTIONS = MODEL + "refiner_options"
 
 def code_of_trials() -> str:
     """Digest all code that decides a trial's result: beags, packages that extend it, and what measures here."""
-    measure = Path(__file__).with_name("measure.py")
     points = (point for each in distributions() for point in each.entry_points if point.group.startswith("beags."))
     packages = {point.value.partition(":")[0].partition(".")[0] for point in points} - {__name__.partition(".")[0]}
-    files = [measure]
+    files = [Path(__file__).with_name("measure.py")]
     for name in sorted(packages):
         if (found := find_spec(name)) is not None and found.origin is not None:
             file = Path(found.origin)

@@ -45,8 +45,6 @@ WORK = {  # shows at once that it has begun
     "beags eval --load-config {run}": "run",
     "ns-train beags --help": "",
 }
-
-
 EXPORTS = {  # of the demo, to seconds of CPU
     "beags export --load-config {run} --object {object} --format ply --output {tmp}/ply": 4.0,
     "beags export --load-config {run} --object {object} --format glb --output {tmp}/glb": 10.0,
