@@ -26,7 +26,7 @@ class Shout:
 
 @pytest.fixture
 def installed(tmp_path, monkeypatch):
-    """A function that makes the named commands the only ones of other packages, each ``Shout`` of a module of its own."""
+    """A function that makes the named commands the only ones of other packages, each of a module of its own."""
     monkeypatch.syspath_prepend(tmp_path)
 
     def install(*names: str) -> None:
@@ -60,7 +60,7 @@ def test_our_commands_look_for_no_others(monkeypatch):
     ("names", "words", "sentence"),
     [
         ((), ["bench", "compare", "--plan"], "call pip install ./benchmarks, or make setup."),
-        (("export",), ["shout"], "another package adds a command 'export', which beags has: uninstall that package."),
+        (("export",), ["shout"], "another package adds a command 'export', which beags has already: uninstall that package."),
     ],
 )
 def test_what_cannot_be_is_one_sentence(installed, capsys, names, words, sentence):
