@@ -60,7 +60,7 @@ def test_our_commands_look_for_no_others(monkeypatch):
     ("names", "words", "sentence"),
     [
         ((), ["bench", "compare", "--plan"], "call pip install ./benchmarks, or make setup."),
-        (("export",), ["shout"], "another package adds a command 'export', which beags has already: uninstall that package."),
+        (("export",), ["shout"], "adds a command 'export', which beags has already: uninstall that package."),
     ],
 )
 def test_what_cannot_be_is_one_sentence(installed, capsys, names, words, sentence):
