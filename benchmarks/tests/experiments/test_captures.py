@@ -27,7 +27,7 @@ from beags_benchmarks.experiments.captures.pictures import _bulk
 from beags_benchmarks.experiments.captures.run import run_captures
 from beags_benchmarks.experiments.captures.tables import groups, mean_rows, psnr_cost, tables
 from beags_benchmarks.experiments.engines import trial_folder
-from beags_benchmarks.experiments.experiment import Variant, load_experiment
+from beags_benchmarks.experiments.experiment import FILES, Variant, load_experiment
 from beags_benchmarks.experiments.results import FIGURES, ResultRow
 from beags_benchmarks.experiments.scenes import TrialScene
 from beags_benchmarks.experiments.trials import MODEL, plan
@@ -38,9 +38,8 @@ from beags_plugin.objects import make_masks
 from beags_plugin.plugin.presets import preset_config
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.shipped import shipped_folder
 
-ROWS = shipped_folder("experiments") / "captures" / "rows.toml"
+ROWS = FILES / "captures" / "rows.toml"
 
 
 def printed(capsys) -> str:
