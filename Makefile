@@ -70,4 +70,4 @@ format: setup
 clean:
 	rm -rf build dist .cache .pytest_cache .ruff_cache .hypothesis
 	find . -path ./.venv -prune -o -name __pycache__ -type d -exec rm -rf {} +
-	rm -f "$(BEAGS_VENV)/.beags-source"
+	rm -f "$(BEAGS_VENV)/.beags-source" "$(BEAGS_VENV)/.beags-joined"

@@ -1,7 +1,8 @@
-"""Count what the house is made of: ``python scripts/counts.py``; options need nerfstudio, and are left out without."""
+"""Count what the house is made of: ``python scripts/counts.py [--options]``."""
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,15 +11,26 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def lines(folder: str) -> int:
-    """Return the number of lines of Python in ``folder``."""
-    return sum(len(path.read_text("utf8").splitlines()) for path in (ROOT / folder).rglob("*.py"))
+def lines(folder: str, *suffixes: str) -> int:
+    """Return the number of lines of the files with these suffixes in ``folder``, tests aside; 0 without the folder."""
+    paths = [path for suffix in suffixes for path in (ROOT / folder).rglob(f"*{suffix}")]
+    paths = [path for path in paths if not {"tests", "build"} & {*path.relative_to(ROOT / folder).parts}]
+    return sum(len(path.read_text("utf8").splitlines()) for path in paths)
 
 
-def words() -> tuple[int, int]:
-    """Return the numbers of documents in docs/ and of words in them."""
-    documents = [path.read_text("utf8") for path in (ROOT / "docs").glob("*.md")]
-    return len(documents), sum(len(text.split()) for text in documents)
+def table() -> Iterator[tuple[str, int]]:
+    """Yield what is counted, and how much of it there is."""
+    yield "lines of Python in beags_plugin/", lines("beags_plugin", ".py")
+    yield "lines of Python in baselines/", lines("baselines", ".py")
+    yield "lines of Python and TOML in benchmarks/", lines("benchmarks", ".py", ".toml")
+    for folder in ("tests", "baselines/tests", "benchmarks/tests"):
+        yield f"lines of Python in {folder}/", lines(folder, ".py")
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    yield (
+        f"words in README.md and {len(pages) - 1} pages of docs/",
+        sum(len(page.read_text("utf8").split()) for page in pages),
+    )
+    yield "lines of JSON in docs/results/", lines("docs/results", ".json")
 
 
 def options() -> list[str]:
@@ -60,17 +72,16 @@ def _is_theirs(kind: type) -> bool:
 
 
 def main() -> None:
-    loose = [path.name for path in (ROOT / "beags_plugin").glob("*.py") if path.name != "__init__.py"]
-    print(f"{lines('beags_plugin'):,} lines of Python in beags_plugin/, {len(loose)} loose files at its top")
-    print(f"{lines('tests'):,} lines of Python in tests/")
-    print("{} documents with {:,} words in docs/".format(*words()))
-    try:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--options", action="store_true", help="list the options of ns-train beags that are ours too")
+    chosen = parser.parse_args()
+    for what, count in table():
+        print(f"{count:>8,} {what}")
+    if chosen.options:
         found = options()
-    except ImportError as error:
-        print(f"options are left out: {error}")
-    else:
-        print(f"{len(found)} options of ns-train beags are ours:")
-        print("\n".join(f"  --{name}" for name in found))
+        print(
+            f"{len(found):>8,} options of ns-train beags that are ours:", *(f"--{name}" for name in found), sep="\n  "
+        )
 
 
 if __name__ == "__main__":

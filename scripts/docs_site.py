@@ -29,6 +29,7 @@ PLACES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGE
 LINK = re.compile(r"(?P<before>!?\[(?P<text>[^\]]*)\]\()(?P<goal>[^)\s#]+)(?P<anchor>#[^)\s]*)?(?P<after>[^)]*\))")
 SOURCE = re.compile(r'(?P<before>src=")(?P<goal>[^"#]+)(?P<after>")')
 
+PACKAGES = (ROOT / "beags_plugin", ROOT / "benchmarks" / "beags_benchmarks")
 INTERFACES = {  # by entry-point group
     "beags.rasterizers": "beags_plugin.rasterizers.interface",
     "beags.losses": "beags_plugin.losses.base",
@@ -38,7 +39,7 @@ INTERFACES = {  # by entry-point group
     "beags.mask_sources": "beags_plugin.masks.sources.base",
     "beags.exporters": "beags_plugin.export.base",
     "beags.importers": "beags_plugin.importers.base",
-    "beags.engines": "beags_plugin.bench.engines.interface",
+    "beags.engines": "beags_benchmarks.experiments.engines.interface",
 }
 
 
@@ -148,7 +149,7 @@ def write_pages(folder: Path) -> None:
     for document in [*(ROOT / name for name in PLACES), *sorted((ROOT / "docs").glob("*.md"))]:
         place = PLACES.get(str(document.relative_to(ROOT)), document.name)
         pages[place] = rewritten(document.read_text("utf8"), document, repository, shown)
-    pages |= {each.page: reference(each) for each in registries(ROOT / "beags_plugin")}
+    pages |= {each.page: reference(each) for package in PACKAGES for each in registries(package)}
     for place, text in pages.items():
         (folder / place).parent.mkdir(parents=True, exist_ok=True)
         (folder / place).write_text(text, "utf8")

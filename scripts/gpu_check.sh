@@ -19,7 +19,7 @@ fi
 stages=("$@")
 if [ ${#stages[@]} = 0 ]; then stages=(build tests memcheck racecheck synccheck benchmark); fi
 mkdir -p "$out"
-export OMP_WAIT_POLICY=PASSIVE PYTHONPATH="$PWD${PYTHONPATH:+:$PYTHONPATH}" PYTHONUNBUFFERED=1
+export OMP_WAIT_POLICY=PASSIVE PYTHONPATH="$PWD:$PWD/benchmarks${PYTHONPATH:+:$PYTHONPATH}" PYTHONUNBUFFERED=1
 
 fail() {
   echo "gpu_check: $1" >&2
@@ -61,14 +61,14 @@ sanitized() { # a tool of compute-sanitizer on a small scene, three minutes at m
     return 77
   }
   PYTORCH_NO_CUDA_MEMORY_CACHING=1 timeout --kill-after 10 170 compute-sanitizer --tool "$1" --error-exitcode 9 \
-    "$python" -m benchmarks.cuda --smoke
+    "$python" -m beags_benchmarks.kernels.cuda --smoke
 }
 memcheck() { sanitized memcheck; }
 racecheck() { sanitized racecheck; }
 synccheck() { sanitized synccheck; }
 
 benchmark() {
-  "$python" -m benchmarks.cuda --json "$out/cuda.json" --seconds "${BENCHMARK_SECONDS:-500}" \
+  "$python" -m beags_benchmarks.kernels.cuda --json "$out/cuda.json" --seconds "${BENCHMARK_SECONDS:-500}" \
     --gsplat-seconds "${GSPLAT_SECONDS:-150}"
 }
 

@@ -4,7 +4,7 @@
 # From one base of beags-paper (30,000 steps) for each capture, 3,000 steps with the paper's losses, as many with neither,
 # and the refinement of beags with its own control; photos of at most PIXELS (806) along the longer side. Captures: fruit
 # and garden if none is named; they train at the same time on one GPU. It needs an NVIDIA GPU, and a Python (PYTHON,
-# default python3) with this package, its CUDA extension, and nerfstudio. A second call goes on where the first ended, so
+# default python3) with this package, its CUDA extension, nerfstudio, and benchmarks/. A second call goes on where the first ended, so
 # a call ends after SECONDS_LIMIT (600). Logs and <capture>.json go to FOLDER (default outputs/gpu_paper).
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -34,6 +34,7 @@ if [ ${#captures[@]} = 0 ]; then captures=(fruit garden); fi
 [ -d "$truth" ] || fail "--truth '$truth' is no folder: name the one that holds traced silhouettes"
 command -v nvidia-smi >/dev/null && nvidia-smi -L || fail "there is no NVIDIA GPU, or no driver for it"
 "$python" -c 'import nerfstudio' 2>/dev/null || fail "$python has no nerfstudio: install this package there (docs/install.md)"
+"$python" -c 'import beags_benchmarks' 2>/dev/null || fail "$python has no beags bench: call $python -m pip install ./benchmarks"
 reason="$("$python" -c 'from beags_plugin.rasterizers.cuda import CudaRasterizer as R; print(R.unavailable() or "")' 2>&1 | tail -n 1)"
 [ -z "$reason" ] || fail "$reason"
 mkdir -p "$out"

@@ -50,6 +50,13 @@ source_now="$(pwd) $({
   printf '%s\n' cmake/cuda.cmake
   find beags_plugin -type f -name '*.[ch]*' ! -name '*.pyc'
 } | digest) $(find beags_plugin -name '*.py' | sort | sha256sum | cut -c1-16)"
+# Distributions beside beags that join it by entry points; a module of theirs is found wherever it lies in its folder.
+joined=()
+for folder in baselines benchmarks; do
+  if [ -f "$folder/pyproject.toml" ]; then joined+=("$folder"); fi
+done
+joined_now="$(pwd) $(printf '%s/pyproject.toml\n' "${joined[@]}" | digest)"
+joined_before="$(cat "$env/.beags-joined" 2>/dev/null || true)"
 # The editable install maps every module to its file, so a module that moved needs a new one.
 packages_before="$(cat "$env/.beags-packages" 2>/dev/null || true)"
 source_before="$(cat "$env/.beags-source" 2>/dev/null || true)"
@@ -72,7 +79,7 @@ if [ "$packages_now" != "$packages_before" ]; then
   fi
   rm -f "$env/.beags-packages" "$env/.beags-source"
   # pybind11 is for fpsample, which comes to some machines as source only.
-  pip install -qq "${pins[@]}" scikit-build-core nanobind ninja pybind11 'setuptools<81'
+  pip install -qq "${pins[@]}" scikit-build-core nanobind ninja pybind11 'setuptools>=77,<81'
   if ! command -v cmake >/dev/null; then pip install -qq cmake; fi
   # Without a CUDA toolkit, nvcc of the version that torch was built with.
   if [ "$(uname -s)" = Linux ] && [ ${#pins[@]} -gt 0 ] && ! command -v nvcc >/dev/null && [ ! -x /usr/local/cuda/bin/nvcc ]; then
@@ -93,4 +100,11 @@ elif [ "$source_now" != "$source_before" ]; then
   rm -f "$env/.beags-source"
   pip install -qq --no-deps --no-build-isolation "${build[@]}" -e .
   echo "$source_now" >"$env/.beags-source"
+fi
+if [ "$joined_now" != "$joined_before" ]; then
+  rm -f "$env/.beags-joined"
+  for folder in "${joined[@]}"; do
+    pip install -qq --no-deps --no-build-isolation -e "./$folder"
+  done
+  echo "$joined_now" >"$env/.beags-joined"
 fi

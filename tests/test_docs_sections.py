@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-CITING = ("beags_plugin", "tests", "benchmarks", "experiments", "method_configs")
+CITING = ("beags_plugin", "tests", "benchmarks", "method_configs")
 SUFFIXES = {".py", ".h", ".cpp", ".cu", ".cuh", ".toml", ".yaml", ".yml"}
 DOCUMENTS = [path for room in (".", "benchmarks", "docs", "notes") for path in sorted((ROOT / room).glob("*.md"))]
 

@@ -47,7 +47,7 @@ def test_the_navigation_leads_to_every_page_once(pages):
 def test_every_registry_has_a_page_with_its_interface_and_what_is_built_in(pages):
     from beags_plugin.refiners import REFINERS
 
-    found = {each.group: each for each in docs_site.registries(ROOT / "beags_plugin")}
+    found = {each.group: each for package in docs_site.PACKAGES for each in docs_site.registries(package)}
     assert set(found) == set(docs_site.INTERFACES)
     assert set(found[REFINERS.group].builtin) <= set(REFINERS.names())
     for each in found.values():

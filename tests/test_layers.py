@@ -16,7 +16,6 @@ PACKAGE = Path(__file__).resolve().parents[1] / "beags_plugin"
 # Rooms in order, from what people call to what knows nothing of scenes. Rooms on one line do not import one another.
 ROOMS = [
     "commands",
-    "bench",
     "plugin",  # its own files; the rooms inside it follow
     "plugin/viewer",
     "plugin/training",
@@ -49,7 +48,7 @@ TARGETS = {
     "plugin/pipeline",
     "plugin/trainer",
 }  # a config of nerfstudio's names what it sets up, above it
-NERFSTUDIO = {"commands", "bench"}  # and all rooms of plugin/
+NERFSTUDIO = {"commands"}  # and all rooms of plugin/
 
 
 def room_of(module: str) -> str:
@@ -191,7 +190,14 @@ def test_the_plugin_adds_nothing_heavy_to_a_nerfstudio_command():
     pytest.importorskip("nerfstudio")
     before = loaded_by("import nerfstudio.configs.method_configs")
     assert "beags_plugin.plugin.methods" in before, "the entry points of this package are not installed"
-    assert not before & {"open3d", "beags_plugin.sample.writer", "beags_plugin.bench.run"}
+    assert not before & {"open3d", "beags_plugin.sample.writer", "beags_benchmarks"}
+
+
+def test_nothing_imports_the_distributions_beside_it():
+    """They join by entry points alone, as anybody's package does."""
+    for module, path in MODULES.items():
+        names = {name.split(".")[0] for name in imported(path.read_text())}
+        assert not names & {"beags_benchmarks", "beags_baselines"}, f"beags_plugin/{module}.py"
 
 
 def test_the_package_itself_imports_nothing():

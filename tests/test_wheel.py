@@ -83,7 +83,7 @@ def test_what_is_in_it(built):
 
     (wheel,), (sdist,) = built.glob("*.whl"), built.glob("*.tar.gz")
     assert "-manylinux_2_" in wheel.name
-    package, settings = files("beags_plugin"), files("method_configs") | files("experiments")
+    package, settings = files("beags_plugin"), files("method_configs")
     with ZipFile(wheel) as archive:
         names = {name for name in archive.namelist() if not name.endswith("/") and ".dist-info/" not in name}
         (module,) = (name for name in names if name.startswith("beags_plugin/_native."))

@@ -7,14 +7,14 @@ import sys
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Literal, NoReturn
+from typing import Annotated, Any, Literal, NoReturn, Union, get_args
 
 import tyro
 from rich.console import Console
 from rich.markup import escape
 
-from beags_plugin.bench.commands import Measurement
 from beags_plugin.commands.masks import Masks
+from beags_plugin.commands.more import more_commands
 from beags_plugin.commands.process import Process
 from beags_plugin.commands.starting import check_arguments, starting
 from beags_plugin.commands.view import View
@@ -337,16 +337,6 @@ class Eval:
 
 
 @dataclass
-class Bench:
-    """Measure, and leave tables, JSON, CSV and a picture behind."""
-
-    what: Measurement
-
-    def run(self) -> None:
-        self.what.run()
-
-
-@dataclass
 class Doctor:
     """Report what this installation can do, what is missing, and the one command that repairs each.
 
@@ -382,7 +372,14 @@ def write_json(path: Path | None, content: object) -> None:
         write_text_atomically(json.dumps(content, indent=2, default=str) + "\n", path)
 
 
-Command = Demo | Process | Resume | Sample | Masks | View | Extract | Export | Clean | Render | Eval | Bench | Doctor
+Command = Demo | Process | Resume | Sample | Masks | View | Extract | Export | Clean | Render | Eval | Doctor
+
+
+def all_commands(arguments: list[str] | None) -> Any:
+    """Return the union of our commands, and of other packages' unless the arguments name one of ours."""
+    ours = [command.__name__.lower() for command in get_args(Command)]
+    first = next(iter(sys.argv[1:] if arguments is None else arguments), "")
+    return Command if first in ours else Union[(Command, *more_commands(first, ours))]  # noqa: UP007  (of a tuple)
 
 
 def exit_with(error: UserError) -> NoReturn:
@@ -398,7 +395,7 @@ def main(arguments: list[str] | None = None) -> None:
     description = "BEA-GS: clean objects out of Gaussian-splat scenes."
     silence_libraries()
     try:
-        command = tyro.cli(Command, args=arguments, description=description, config=config)
+        command = tyro.cli(all_commands(arguments), args=arguments, description=description, config=config)
         command.run()
     except UserError as error:
         exit_with(error)

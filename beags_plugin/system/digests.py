@@ -9,16 +9,17 @@ from pathlib import Path
 from typing import Any
 
 _PACKAGE = Path(__file__).parents[1]
-_SHOWING = ("commands", "bench")  # print and draw what the rest has computed
+_SHOWING = "commands"  # prints and draws what the rest has computed
 
 
-def code_digest() -> str:
-    """Digest every file of the package that can change a result, the compiled extension included."""
+def code_digest(*more: Path) -> str:
+    """Digest every file of the package that can change a result, with the compiled extension, and ``more`` files."""
     digest = hashlib.sha256()
     for path in sorted([*_PACKAGE.rglob("*.py"), *_PACKAGE.glob("_native*"), *_PACKAGE.glob("native/**/*")]):
-        if path.is_file() and path.relative_to(_PACKAGE).parts[0] not in _SHOWING:
+        if path.is_file() and path.relative_to(_PACKAGE).parts[0] != _SHOWING:
             digest.update(path.read_bytes())
-    digest.update((_PACKAGE / "bench" / "measure.py").read_bytes())
+    for path in more:
+        digest.update(path.read_bytes())
     return digest.hexdigest()
 
 

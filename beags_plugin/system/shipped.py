@@ -1,4 +1,4 @@
-"""The folders of TOML files that ship with the package, and reading such a file."""
+"""Folders of TOML files that ship with the package, and reading such a file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def shipped_folder(name: str) -> Path:
-    """Return the folder ``name`` (method_configs, experiments) in the installed package, or beside it in a checkout."""
+    """Return the folder ``name`` (method_configs) in the installed package, or beside it in a checkout."""
     installed = _PACKAGE / name
     return installed if installed.is_dir() else _PACKAGE.parent / name
 

@@ -124,8 +124,8 @@ SENTENCES = {
     "bench file {tmp}/absent.toml --output {tmp}/bench": "the experiment {tmp}/absent.toml cannot be read (No such "
     "file or directory): name an existing file of that kind.",
     "bench file ablatoin --output {tmp}/bench": "there is no experiment 'ablatoin' (did you mean ablation?): "
-    "choose one of ablation, classes, compare, compare-consistent, depth, masks, "
-    "presets, refinement, sensitivity, tradeoff, or name a .toml file.",
+    "choose one of ablation, classes, compare, compare-consistent, masks, presets, "
+    "sensitivity, or name a .toml file.",
     # doctor
     "doctor --json {tmp}/file/x.json": "{tmp}/file/x.json cannot be written (File exists): choose another place.",
 }

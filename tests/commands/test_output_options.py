@@ -11,11 +11,11 @@ import typing
 import pytest
 import tyro
 
-from beags_plugin.bench.commands import SHIPPED
+from beags_benchmarks.experiments.commands import SHIPPED
 from beags_plugin.commands import cli, masks
 
 WORDS = [
-    *([command.__name__.lower()] for command in typing.get_args(cli.Command) if command.__name__ not in "MasksBench"),
+    *([command.__name__.lower()] for command in typing.get_args(cli.Command) if command.__name__ != "Masks"),
     *(["masks", action.__name__.lower()] for action in (masks.Check, masks.Make, masks.Reproject, masks.Truth)),
     *(["bench", name] for name in (next(iter(SHIPPED)), "file", "paper", "captures")),
 ]

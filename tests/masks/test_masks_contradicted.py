@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from ball_scenes import SIDE, balls_from, issues, poses, write_balls, write_model
+from damaged_parts import damaged_mask
 from data_folders import write_image
 from parsed_views import real
 from PIL import Image
@@ -70,7 +71,6 @@ def test_masks_that_are_made_are_compared_too(tmp_path, capsys):
 @pytest.mark.slow("a capture of 60 views with masks damaged in several ways")
 def test_damaged_masks_of_a_capture_are_named_and_no_others(tmp_path):
     from beags_plugin.objects.check_masks import check_scene, data_options
-    from benchmarks.masks import damaged_mask
 
     root, generator = real("fruit"), np.random.default_rng(0)
     assert check_scene(data_options(root)).contradictions == []

@@ -151,9 +151,9 @@ def test_the_occupancy_loss_is_the_same_in_every_run(device):
 def test_the_smoke_test_launches_every_variant_and_finds_what_is_not_finite(device, monkeypatch):
     from cuda_backends import EmulatedCudaRasterizer
 
+    from beags_benchmarks.kernels import cuda_smoke
+    from beags_benchmarks.kernels.scenes import Size
     from beags_plugin.rasterizers.cuda import CudaRasterizer
-    from benchmarks import cuda_smoke
-    from benchmarks.scenes import Size
 
     rasterizer = CudaRasterizer() if device.type == "cuda" else EmulatedCudaRasterizer()
     called: set[str] = set()

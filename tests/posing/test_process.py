@@ -13,13 +13,13 @@ from data_folders import noise, write_image
 from photographed_corner import camera, frames, photograph, quiet, write_photos
 from PIL import Image
 
+from beags_benchmarks.studies.poses import errors
 from beags_plugin.commands.cli import main
 from beags_plugin.posing import features
 from beags_plugin.posing.features import _features as find_features
 from beags_plugin.posing.files import MODEL
 from beags_plugin.posing.process import REPORT, process
 from beags_plugin.system.reading.ply import read_ply_points
-from benchmarks.poses import errors
 
 
 @pytest.fixture(scope="module")

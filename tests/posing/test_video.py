@@ -12,9 +12,9 @@ pytest.importorskip("pycolmap")
 from photographed_corner import camera, film, frames, look_alike, photograph, quiet
 from PIL import Image
 
+from beags_benchmarks.studies.poses import errors
 from beags_plugin.posing.process import process
 from beags_plugin.posing.video import choose_frames, find_frames, write_frames
-from benchmarks.poses import errors
 
 ANGLES = np.linspace(0.3, 1.2, 14)
 EACH = 2  # frames from one place

@@ -76,8 +76,8 @@ def test_a_graph_of_forward_and_backward_replays_cuda():
 
 def test_a_training_step_makes_the_host_wait_for_no_copy_cuda():
     """In this mode torch raises where it waits itself; what ``CudaRasterizer`` waits for is an event."""
-    from benchmarks.scenes import Size, make_scene, on_device
-    from benchmarks.training_step import TrainingStep
+    from beags_benchmarks.kernels.scenes import Size, make_scene, on_device
+    from beags_benchmarks.kernels.training_step import TrainingStep
 
     step = TrainingStep(on_device(make_scene(Size(2_000, 130, 100)), "cuda"), 20, CudaRasterizer())
     for _ in range(3):

@@ -8,7 +8,7 @@ import torch
 from open3d.core import Tensor
 from scene_distances import distance
 
-from beags_plugin.bench.scenes import SEEDS
+from beags_benchmarks.experiments.scenes import SEEDS
 from beags_plugin.core.cameras import viewmat_from_opengl
 from beags_plugin.sample.meshes import Mesh, block, extrude, lathe, sweep
 from beags_plugin.sample.room import make_room

@@ -3,7 +3,7 @@
     make fuzz COUNT=1000 SEED=0
     python tests/soak/fuzz.py --count 1000 --seed 0 --json fuzz.json      # the same
 
-Scenes are those of ``benchmarks/degenerate.py``: a few surfels, ordinary or spoilt in one way or two, in a world that
+Scenes are those of ``degenerate.py``: a few surfels, ordinary or spoilt in one way or two, in a world that
 may be scaled and shifted, before a camera of a few pixels. What is asked of each, forward and backward:
 
 - nothing raises, in float32 and in float64;
@@ -31,7 +31,9 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parent)]
+from degenerate import FLOATS, Scene, degenerate_scene  # noqa: E402
+
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.occupancy import OccupancyLoss
@@ -40,7 +42,6 @@ from beags_plugin.rasterizers import make_rasterizer, torch_reference
 from beags_plugin.rasterizers.interface import MIN_TRANSMITTANCE, Rasterizer
 from beags_plugin.rasterizers.rendering import draw_features
 from beags_plugin.system.progress import progress_bar
-from benchmarks.degenerate import FLOATS, Scene, degenerate_scene  # noqa: E402
 
 OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion", "boundary")
 TOLERANCE = 1e-7  # of an output or gradient in float64, in units of the largest number expected, or of 1

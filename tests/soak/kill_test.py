@@ -31,11 +31,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(Path(__file__).resolve().parent)]
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks"), str(Path(__file__).resolve().parent)]
 import forked  # noqa: E402
 import same_bits  # noqa: E402
 
-from beags_plugin.bench.provenance import commit, describe_machine  # noqa: E402
+from beags_benchmarks.provenance import commit, describe_machine  # noqa: E402
 
 OPTIONS = {
     "pipeline.model.base_steps": 80, "pipeline.model.refine_steps": 30,

@@ -24,8 +24,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from beags_plugin.bench.provenance import commit, describe_machine  # noqa: E402
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+from beags_benchmarks.provenance import commit, describe_machine  # noqa: E402
 from beags_plugin.sample.writer import SampleConfig, write_sample
 from beags_plugin.system.child_processes import bound
 

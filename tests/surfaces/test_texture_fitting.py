@@ -15,6 +15,7 @@ from photographed_box import EXPOSURES, EYES, a_box, camera_from, photo_of
 from scipy.sparse.linalg import lsmr
 from threadpoolctl import threadpool_limits
 
+from beags_benchmarks.studies.meshes import Drawn
 from beags_plugin.core.cameras import Camera
 from beags_plugin.surfaces.atlas import picture, texels, unwrapped
 from beags_plugin.surfaces.baking import Places, baked
@@ -23,7 +24,6 @@ from beags_plugin.surfaces.fusion import Mesh
 from beags_plugin.surfaces.item import Photo
 from beags_plugin.surfaces.surface import area_vectors, vertex_normals
 from beags_plugin.surfaces.texture import suitable_density, textured
-from benchmarks.meshes import Drawn
 
 FINE = 75.0  # radians a unit: about six pixels a period
 

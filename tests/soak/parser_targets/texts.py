@@ -32,7 +32,7 @@ def _prompts(path: Path) -> None:
 
 
 def _experiment(path: Path) -> None:
-    from beags_plugin.bench.experiment import load_experiment
+    from beags_benchmarks.experiments.experiment import load_experiment
 
     load_experiment(str(path))
 

@@ -1,1 +1,0 @@
-"""Measurements of the compiled code: see README.md in this folder."""

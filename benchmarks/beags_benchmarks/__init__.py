@@ -1,0 +1,1 @@
+"""Measurements of beags: experiments (``beags bench``), and studies, a program each."""

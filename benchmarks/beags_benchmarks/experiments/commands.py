@@ -1,0 +1,101 @@
+"""The commands of ``beags bench``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Union
+
+import tyro
+
+from beags_benchmarks.experiments.captures.options import CapturesOptions
+from beags_benchmarks.experiments.options import ExperimentOptions
+from beags_benchmarks.experiments.paper.options import PaperOptions
+
+
+@dataclass
+class ShippedExperiment(ExperimentOptions):
+    """Run an experiment of files/."""
+
+    experiment: tyro.conf.Suppress[str] = ""
+
+    def run(self) -> None:
+        from beags_benchmarks.experiments.run import run_experiment
+
+        run_experiment(self.experiment, self)
+
+
+@dataclass
+class ExperimentFile(ExperimentOptions):
+    """An experiment of your own, described by a TOML file like those of
+    benchmarks/beags_benchmarks/experiments/files."""
+
+    file: tyro.conf.Positional[Path] = Path("experiment.toml")
+    """The TOML file."""
+
+    def run(self) -> None:
+        from beags_benchmarks.experiments.run import run_experiment
+
+        run_experiment(str(self.file), self)
+
+
+@dataclass
+class PaperBench(PaperOptions):
+    """The paper's tables: its methods on its data sets, as far as they are on disk. What is missing is listed."""
+
+    def run(self) -> None:
+        from beags_benchmarks.experiments.paper.run import run_paper
+
+        run_paper(self)
+
+
+@dataclass
+class CapturesBench(CapturesOptions):
+    """Real captures, as far as they are on disk: the paper's losses and each preset, scored by traced silhouettes."""
+
+    def run(self) -> None:
+        from beags_benchmarks.experiments.captures.run import run_captures
+
+        run_captures(self)
+
+
+SHIPPED = {
+    "ablation": "What each part gives: assignment alone, without each of reprojection, boundary and occupancy loss, "
+    "all.",
+    "sensitivity": "How much the result depends on k (neighbours that set the voxel size) and Z (samples per "
+    "Gaussian).",
+    "masks": "How much damage to the masks costs, with and without reprojection.",
+    "presets": "What the refinements of the presets cost and give, from one base.",
+    "compare": "The paper's twelve other methods beside this one, from one base, on identical masks.",
+    "compare-consistent": "The same with the consistent masks of this method for all.",
+    "classes": "How time and memory of each method grow with the number of classes.",
+}
+"""Commands by experiment, with the sentence of their help."""
+
+if TYPE_CHECKING:
+    Measurement = ShippedExperiment | ExperimentFile | PaperBench | CapturesBench
+else:
+    Measurement = Union[  # noqa: UP007  (of a tuple)
+        tuple(
+            Annotated[
+                ShippedExperiment,
+                tyro.conf.subcommand(name, default=ShippedExperiment(experiment=name), description=sentence),
+            ]
+            for name, sentence in SHIPPED.items()
+        )
+        + (
+            Annotated[ExperimentFile, tyro.conf.subcommand("file")],
+            Annotated[PaperBench, tyro.conf.subcommand("paper")],
+            Annotated[CapturesBench, tyro.conf.subcommand("captures")],
+        )
+    ]
+
+
+@dataclass
+class Bench:
+    """Measure, and leave tables, JSON, CSV and a picture behind."""
+
+    what: Measurement
+
+    def run(self) -> None:
+        self.what.run()

@@ -1,0 +1,127 @@
+"""Pictures of objects as each variant cuts them out, side by side."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from beags_benchmarks.experiments.engines.interface import Outcome
+from beags_benchmarks.experiments.per_object import OBJECT
+from beags_benchmarks.experiments.trials import OPTIONS, Trial, VariantTrial
+
+if TYPE_CHECKING:
+    from beags_plugin.evaluation.records import EvalView
+    from beags_plugin.objects.evaluate import EvaluatedRun
+
+_SIDE = 150  # pixels of a cell
+_LETTERS = 26  # of a caption in a cell
+_COLUMNS = 10  # variants of a picture
+_LINES = 16  # objects of a picture, where scenes have so many
+
+
+def plot_objects(path: Path, runs: Sequence[VariantTrial], outcomes: Mapping[str, Outcome]) -> list[Path]:
+    """Draw a line for each object, in the held-out view that shows most of it; a column for each variant.
+
+    Of many objects only the largest of each scene are drawn, ``_LINES`` in all or one of each; many variants are shared
+    out to several pictures: ``path``, and after it those with 2, 3, .. in their name. Returns their paths. A variant
+    that failed has an empty cell.
+    """
+    from beags_plugin.pictures.cells import write_picture
+
+    lines, scenes = [], dict.fromkeys(run.scene.name for run in runs)
+    for scene in scenes:
+        of_scene = [run for run in runs if run.scene.name == scene and run.seed == runs[0].seed]
+        lines += _objects(scene, of_scene, outcomes, most=max(_LINES // len(scenes), 1))
+    paths = []
+    for picture in pages(lines):
+        paths.append(path if not paths else path.with_stem(f"{path.stem}-{len(paths) + 1}"))
+        write_picture(paths[-1], picture)
+    return paths
+
+
+def pages(lines: Sequence[Sequence[np.ndarray]], columns: int = _COLUMNS) -> list[np.ndarray]:
+    """Return pictures of these lines of cells: at most so many of a line in each, alike, after the line's first one."""
+    from beags_plugin.pictures.cells import below, beside
+
+    if not lines:
+        return []
+    count = len(lines[0]) - 1
+    number = max(math.ceil(count / columns), 1)
+    ends = [1 + count * page // number for page in range(number + 1)]
+    return [
+        below([beside([line[0], *line[first:last]]) for line in lines])
+        for first, last in zip(ends, ends[1:], strict=False)
+    ]
+
+
+def _objects(
+    scene: str, runs: Sequence[VariantTrial], outcomes: Mapping[str, Outcome], most: int
+) -> list[list[np.ndarray]]:
+    """Return the cells of the ``most`` largest objects of a scene, each with its photo first."""
+    from beags_plugin.core.select import select_class
+    from beags_plugin.objects.evaluate import EvaluatedRun
+    from beags_plugin.pictures.cells import cell, crop, square_around
+    from beags_plugin.pictures.object_cells import alone, over_board
+    from beags_plugin.runs.read import read_run
+
+    done = [trial for run in runs for trial in run.trials if outcomes[trial.digest].failed is None]
+    if not done:
+        return []
+    first = EvaluatedRun(outcomes[done[0].digest].folder / "run/config.yml")
+    scenes = {trial.digest: read_run(outcomes[trial.digest].folder / "run/config.yml") for trial in done}
+    rows = []
+    for class_id, (view, truth) in sorted(_largest(first, most).items()):
+        name = first.classes[class_id]
+        assert view.image is not None
+        drawn: list[np.ndarray | None] = []
+        for run in runs:
+            trial = next((trial for trial in run.trials if _cuts(trial, name)), None)
+            found = None if trial is None else scenes.get(trial.digest)
+            image = None
+            if found is not None:
+                part = select_class(found.surfels(), found.members, class_id)[0]
+                image = alone(part, view.camera, first.settings, first.rasterizer)
+            drawn.append(image)
+        shape = next((image.shape[:2] for image in drawn if image is not None), truth.shape)
+        window = square_around(truth if truth.shape == shape else np.ones(shape, dtype=bool))
+        photo = (view.image.clamp(0, 1) * 255).byte().cpu().numpy()
+        white = np.full((_SIDE, _SIDE, 3), 255, np.uint8)
+        pictures = [
+            crop(photo, window),
+            *(white if image is None else over_board(crop(image, window), _SIDE) for image in drawn),
+        ]
+        captions = captioned([f"{scene}: {name}", *(run.variant.name for run in runs)])
+        rows.append([cell(image, (_SIDE, _SIDE), text) for image, text in zip(pictures, captions, strict=True)])
+    return rows
+
+
+def captioned(names: Sequence[str], letters: int = _LETTERS) -> list[str]:
+    """Return the names in lines of at most so many letters, as many lines of each, so that cells are alike."""
+    lines = [textwrap.wrap(name, letters) or [""] for name in names]
+    most = max(map(len, lines))
+    return ["\n".join([*each, *[""] * (most - len(each))]) for each in lines]
+
+
+def _largest(run: EvaluatedRun, most: int) -> dict[int, tuple[EvalView, np.ndarray]]:
+    """Return the ids of the objects of which a held-out view shows most pixels, the view, and its mask [H, W] bool."""
+    from beags_plugin.evaluation.truths import extracted_truth
+
+    found: list[tuple[int, int, EvalView, np.ndarray]] = []
+    for class_id in sorted(run.classes):
+        truths = [(view, extracted_truth(view, class_id)) for view in run.views] if class_id != 0 else []
+        seen = [(int(truth.mask.sum()), view, truth.mask) for view, truth in truths if truth is not None]
+        if seen:
+            pixels, view, mask = max(seen, key=lambda each: each[0])
+            found.append((pixels, class_id, view, mask.cpu().numpy()))
+    found.sort(key=lambda each: -each[0])
+    return {class_id: (view, mask) for _, class_id, view, mask in found[:most]}
+
+
+def _cuts(trial: Trial, name: str) -> bool:
+    """Return whether a trial cuts the object out: all of them, or its own alone."""
+    return trial.overrides.get(OPTIONS, {}).get(OBJECT, name) == name

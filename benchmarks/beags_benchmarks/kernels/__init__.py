@@ -1,0 +1,1 @@
+"""How fast the compiled rasterizer and ops are, on the CPU and on a GPU."""

@@ -1,0 +1,55 @@
+"""README's curve of CPU seconds against extracted BIoU: ``python -m beags_benchmarks.studies.cost_curve``.
+
+It is drawn from the files of docs/results that README's table is made from, and from those of the trade-off.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from beags_benchmarks.experiments.report import new_figure, save_figure
+from beags_benchmarks.experiments.results import MEAN
+from beags_benchmarks.studies.page_tables import CAPTURES, ROOT
+
+LABELS = {
+    "assignment alone": "classes alone",
+    "the paper's losses": "the paper's losses, 3,000 steps",
+    "beags-refine": "beags-refine, 800 steps",
+    "beags-fast": "beags-fast, 200 steps",
+}
+MARKS = {"assignment alone": "o", "the paper's losses": "s", "beags-refine": "^", "beags-fast": "D"}
+COLORS = ("#d94801", "#2171b5", "#238b45", "#6a51a3")
+
+
+def draw(root: Path = ROOT) -> Path:
+    """Draw docs/images/cost.png; returns its path. Raises ``FileNotFoundError`` without the results."""
+    figure, axes = new_figure(1, 1, size=(6.4, 3.6))
+    panel: Any = axes[0, 0]
+    for color, (name, (file, scene)) in zip(COLORS, CAPTURES.items(), strict=False):
+        report = json.loads((root / "docs" / "results" / f"{file}.json").read_text())
+        rows = {
+            row["variant"]: row for row in report["rows"] if (row["scene"], row.get("object", MEAN)) == (scene, MEAN)
+        }
+        points = sorted((rows[row]["cpu_seconds"], 100 * rows[row]["extracted_biou_after"], row) for row in LABELS)
+        panel.plot([x for x, *_ in points], [y for _, y, _ in points], color=color, lw=1, label=name)
+        for x, y, row in points:
+            panel.plot(x, y, MARKS[row], color=color, ms=6)
+    for row, label in LABELS.items():
+        panel.plot([], [], MARKS[row], color="grey", label=label)
+    panel.set_xscale("log")
+    panel.xaxis.set_major_formatter("{x:g}")
+    panel.set_xlabel("CPU seconds after the base")
+    panel.set_ylabel("extracted BIoU, %")
+    panel.grid(alpha=0.3)
+    figure.legend(loc="outside right upper", fontsize="small")
+    path = root / "docs" / "images" / "cost.png"
+    save_figure(path, figure)
+    return path
+
+
+if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
+    print(draw())

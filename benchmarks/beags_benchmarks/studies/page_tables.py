@@ -1,0 +1,240 @@
+"""Tables of README and the pages: ``python -m beags_benchmarks.studies.page_tables [captures.json ...]``.
+
+Each given result of ``beags bench`` is reduced to its means, the extracted BIoU of each object, protocol, command,
+commit and machine in docs/results. Then every table of ``TABLES`` is written anew between its two marks, from the files
+there, which are the only source of its figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from beags_benchmarks.experiments.report import number, write_json
+from beags_benchmarks.experiments.results import MEAN
+from beags_plugin.system.errors import UserError
+from beags_plugin.system.whole_files import write_text_atomically
+
+ROOT = Path(__file__).resolve().parents[3]  # of a clone, whose pages are written
+END = "<!-- end of the table -->\n"
+MOST_ROWS = 8
+
+Figure = tuple[str, int, float]
+"""Its name in a row, digits, factor."""
+IOU: Figure = ("extracted_iou_after", 1, 100.0)
+BIOU: Figure = ("extracted_biou_after", 1, 100.0)
+SPILL: Figure = ("extracted_spill_after", 1, 100.0)
+RENDERED: Figure = ("rendered_biou_after", 1, 100.0)
+FITTED: Figure = ("psnr_fit_after", 2, 1.0)
+SECONDS: Figure = ("cpu_seconds", 0, 1.0)
+ALL_SECONDS: Figure = ("cpu_seconds total", 0, 1.0)
+BEAR, DIGGER = "bear, salient", "kitchen, salient"
+
+
+@dataclass(frozen=True)
+class PageTable:
+    """A table of one page: a line for each row of a result, a column for each of its scenes.
+
+    page: path below the root. name: in its marks. columns: by what they are called, the file of docs/results, without
+    ".json", and the scene there. rows: names of the results' rows. figures: what each cell holds, in order.
+    """
+
+    page: str
+    name: str
+    columns: Mapping[str, tuple[str, str]]
+    rows: Sequence[str]
+    figures: Sequence[Figure]
+
+    @property
+    def begin(self) -> str:
+        """Return the mark before the table, a line."""
+        return f"<!-- table {self.name}, made by python -m beags_benchmarks.studies.page_tables -->\n"
+
+
+CAPTURES = {"bear, 400 pixels": ("captures-bear", BEAR), "digger, 480 pixels": ("captures-kitchen", DIGGER)}
+"""README's columns."""
+TABLES: tuple[PageTable, ...] = (
+    PageTable(
+        "README.md",
+        "captures",
+        CAPTURES,
+        ("assignment alone", "the paper's losses", "beags-fast", "beags-refine"),
+        (BIOU, SPILL, FITTED, SECONDS),
+    ),
+    PageTable(
+        "docs/results.md",
+        "captures-all",
+        CAPTURES,
+        (
+            "assignment alone",
+            "as long as beags-fast, neither loss",
+            "beags-fast",
+            "as long as beags-refine, neither loss",
+            "beags-refine",
+            "the paper's losses",
+        ),
+        (IOU, BIOU, SPILL, RENDERED, FITTED, SECONDS),
+    ),
+    PageTable(
+        "docs/results.md",
+        "captures-more",
+        {
+            "vase and table, 400 pixels": ("captures-garden", "garden, picked"),
+            "apple and banana, 400 pixels": ("captures-fruit", "fruit, given"),
+        },
+        ("assignment alone", "as long as beags-fast, neither loss", "beags-fast"),
+        (IOU, BIOU, SPILL, RENDERED, FITTED, SECONDS),
+    ),
+    PageTable(
+        "docs/results.md",
+        "trade-off",
+        {"digger, 260 pixels": ("trade-off-kitchen", DIGGER)},
+        ("200 steps (beags-fast)", "50 steps", "800 steps", "k / 8", "k x 8", "Z = 5", "Z = 100", "no reprojection"),
+        (BIOU, SPILL, FITTED, SECONDS),
+    ),
+    PageTable(
+        "docs/results.md",
+        "bases",
+        {"digger, 260 pixels": ("trade-off-kitchen", DIGGER)},
+        (
+            "200 steps (beags-fast)",
+            "base: no wider limits far away",
+            "base: free space not cleared",
+            "base: large Gaussians go",
+            "base: no normal consistency",
+            "base: with distortion",
+        ),
+        (BIOU, RENDERED, FITTED, ALL_SECONDS),
+    ),
+    PageTable(
+        "docs/comparison.md",
+        "comparison",
+        {"bear, 260 pixels": ("comparison-bear", BEAR), "digger, 260 pixels": ("comparison-kitchen", DIGGER)},
+        (
+            "assignment alone",
+            "flashsplat",
+            "gaussiancut",
+            "trace3d",
+            "objectgs",
+            "cob-gs, one scene",
+            "the paper's losses, same masks",
+            "beags-fast, same masks",
+        ),
+        (BIOU, SPILL, RENDERED, FITTED, SECONDS),
+    ),
+)
+_SOURCE = ("experiment", "preset", "reference", "command", "commit", "machine", "torch", "busy", "quick", "protocol")
+_KEPT = (
+    "extracted_iou_after",
+    "extracted_biou_after",
+    "worst_biou_after",
+    "psnr_after",
+    "psnr_shown_after",
+    "removal_psnr_after",
+    "removal_psnr_shown_after",
+)
+_ROW = ("scene", "seed", "variant", "failed", "failures", "error_left", "lost_biou", "shown_after", "ssim_after",
+        "rendered_iou_after", "rendered_biou_after", "extracted_spill_before", "extracted_spill_after",
+        "psnr_fit_before", "psnr_fit_after", "removal_ssim_after", "removal_remains_after", "steps",
+        "cpu_seconds", "cpu_seconds total", "own_memory_mb", "peak_memory_mb", "objects")  # fmt: skip
+_OF_OBJECTS = "extracted_biou_after"
+
+
+def reduced(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is kept of a result of ``beags bench``: its source, means, and the means of each scene.
+
+    Each row of a scene has "objects", {name: extracted BIoU, or None}, where the result has rows of objects.
+    """
+    objects: dict[tuple[Any, ...], dict[str, float | None]] = {}
+    for line in report["rows"]:
+        if (name := line.get("object", MEAN)) != MEAN:
+            value = line[_OF_OBJECTS]
+            objects.setdefault(_place(line), {})[name] = None if value is None else round(value, 4)
+    kept = (*_ROW, *_KEPT)
+
+    def row(full: Mapping[str, Any]) -> dict[str, Any]:
+        found = {name: full[name] for name in kept if full.get(name) is not None}
+        return {name: round(value, 6) if isinstance(value, float) else value for name, value in found.items()}
+
+    source = {name: report[name] for name in _SOURCE if name in report}
+    if "command" in source:
+        source["command"] = _without_places(source["command"])
+    return {
+        **source,
+        "means": [row(mean) for mean in report["means"]],
+        "rows": [
+            row({"objects": objects.get(_place(line)), **line})
+            for line in report["rows"]
+            if line.get("object", MEAN) == MEAN
+        ],
+    }
+
+
+def _without_places(command: str) -> str:
+    """Return a command without ``--output`` and the folders of its data, which are the machine's own."""
+    return re.sub(r"(?<=\s)/\S*/(?=[^/\s])", "", re.sub(r"\s--output\s+\S+", "", command))
+
+
+def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    return row["scene"], row.get("seed"), row["variant"]
+
+
+def lines_of(table: PageTable, folder: Path) -> str:
+    """Return a table in Markdown, from the files of ``folder``; raises ``UserError`` for what lacks."""
+    lines = [["", *table.columns], ["---"] * (1 + len(table.columns))]
+    for name in table.rows:
+        cells = []
+        for file, scene in table.columns.values():
+            row = _row_of(folder / f"{file}.json", name, scene)
+            shown = (number(row.get(figure), digits, factor) for figure, digits, factor in table.figures)
+            cells.append("failed" if row.get("failed") else ", ".join(shown))
+        lines.append([f"`{name}`" if name.startswith("beags") and " " not in name else name, *cells])
+    return "".join(f"| {' | '.join(line)} |\n".replace("|  |", "| |") for line in lines)
+
+
+def _row_of(path: Path, name: str, scene: str) -> Mapping[str, Any]:
+    for row in json.loads(path.read_text())["rows"]:
+        if (row["variant"], row["scene"], row.get("object", MEAN)) == (name, scene, MEAN):
+            return row
+    raise UserError(f"{path} has no figures of {name!r} on {scene!r}: name a whole result of beags bench.")
+
+
+def write_tables(root: Path = ROOT) -> None:
+    """Write every table anew into its page; raises ``UserError`` for a page that lacks its marks."""
+    for table in TABLES:
+        page = root / table.page
+        before, begin, rest = page.read_text().partition(table.begin)
+        _, end, after = rest.partition(END)
+        if not (begin and end):
+            raise UserError(
+                f"{page} lacks the lines {table.begin.strip()} and {END.strip()}: put them around the table."
+            )
+        lines = lines_of(table, root / "docs" / "results")
+        write_text_atomically(f"{before}{begin}\n{lines}\n{end}{after}", page)
+
+
+def main(arguments: Sequence[str], root: Path = ROOT) -> None:
+    """Reduce the named results into docs/results, and write all tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("results", nargs="*", metavar="[NAME=]FILE", help="NAME: of the file in docs/results")
+    for argument in parser.parse_args(arguments).results:
+        name, _, file = argument.rpartition("=")
+        path = Path(file)
+        report = json.loads(path.read_text())
+        if report.get("quick"):
+            raise UserError(f"{path} is of --quick, whose figures mean nothing: run the experiment whole.")
+        write_json(root / "docs" / "results" / f"{name or path.stem}.json", reduced(report))
+    write_tables(root)
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except UserError as error:
+        sys.exit(str(error))
