@@ -13,9 +13,8 @@ from beags_baselines import prototypes as parts
 from beags_baselines.instascene import ContrastTraining, InstaSceneRefiner
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.refiners import make_refiner
 from beags_plugin.preparation.refiner_training import TrainedScene
-from beags_plugin.refiners import make_refiner, mask_tracking
+from beags_plugin.refiners import make_refiner
 from beags_plugin.system.errors import UserError
 
 FEW = {"min_gaussians": 5, "samples": 2_000}

@@ -12,9 +12,8 @@ from trained_scenes import FAR_APART, loss_inputs, trained_scene
 
 from beags_baselines import object_codebook
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.refiners import make_refiner
 from beags_plugin.preparation.refiner_training import TrainedScene
-from beags_plugin.refiners import make_refiner, object_codebook
+from beags_plugin.refiners import make_refiner
 
 REFINERS = {
     "instascene": {"min_gaussians": 5, "samples": 500},

@@ -1,4 +1,4 @@
-"""The page: its table of options is that of the classes, its methods are those that are installed, its command parses."""
+"""The page: its options are those of the classes, its methods those that are installed, and its command parses."""
 
 from __future__ import annotations
 
