@@ -122,6 +122,14 @@ def test_objects_are_extracted_and_exported(refined, tmp_path, name):
     assert {item.name: item.gaussians for item in exported} == {k: int(v.sum()) for k, v in expected.items()}
 
 
+def test_a_run_of_a_refiner_that_is_not_installed_is_read(refined, tmp_path, monkeypatch):
+    config = refined("pulse") / "config.yml"
+    monkeypatch.delitem(REFINERS._specs, "pulse")
+    assert set(evaluate_run(config).after.objects) == {1, 2}
+    assert {item.name for item in extract_objects(config, output=tmp_path / "extracted")} == {"cup", "box"}
+    assert len(export_run(config, ["cup"], output=tmp_path / "exports")) == 1
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
