@@ -24,6 +24,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.preparation.refiner import Refiner
 from beags_plugin.preparation.refiner_training import Edit, OwnTraining, TrainedScene
+from beags_plugin.rasterizers.optional import optional_products
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.filed_tensors import filed
@@ -169,7 +170,8 @@ class CobGsTraining(OwnTraining):
             return table.T.flip(0)  # inside first
 
         def counts(place: int) -> Tensor:
-            found = scene.rasterizer.sparse_class_pixel_counts(inputs, cameras[place], scene.settings, mask(place), 2)
+            rasterizer = optional_products(scene.rasterizer)
+            found = rasterizer.sparse_class_pixel_counts(inputs, cameras[place], scene.settings, mask(place), 2)
             table = inputs.means.new_zeros(2 * len(surfels))
             table[found[0]] = found[1].to(table)
             return table.view(-1, 2).T.flip(0)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -23,6 +24,7 @@ from beags_plugin.assignment.contributions import Contributions, contributions
 from beags_plugin.assignment.sparse_sums import largest_in_rows
 from beags_plugin.core.membership import Membership
 from beags_plugin.preparation.refiner import AssignedScene, Refiner
+from beags_plugin.rasterizers.optional import optional_products
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.progress import say
 
@@ -75,7 +77,8 @@ class DrSplatRefiner(Refiner):
     def members(self, scene: AssignedScene) -> Membership:
         views = (scene.surfels, scene.cameras, scene.labels, scene.rasterizer, scene.settings, scene.num_classes)
         with scene.stage("Registering masks") as progress:
-            table = contributions(*views, progress, largest=(self.top_k, self.within))
+            strongest = optional_products(scene.rasterizer).sparse_top_contributions
+            table = contributions(*views, progress, partial(strongest, most=self.top_k, within=self.within))
         whole = float(scene.contributions.sums.sum())
         beyond = 1.0 - float(table.sums.sum()) / whole if whole > 0 else 0.0
         say(f"  registration: {max(beyond, 0.0):.2%} of the weight lies beyond the {self.top_k} strongest of a ray")

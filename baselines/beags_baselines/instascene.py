@@ -24,6 +24,7 @@ from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.preparation.refiner import Refiner
 from beags_plugin.preparation.refiner_training import Edit, OwnTraining, Terms, TrainedScene
+from beags_plugin.rasterizers.optional import optional_products
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import each_view, say
 
@@ -174,7 +175,8 @@ class ContrastTraining(OwnTraining):
             camera = scene.cameras[view]
             labels = self._ranks(view).view(camera.height, camera.width)
             what = (inputs, camera, scene.settings, labels, count, self.options.min_weight)
-            return mask_tracking.TracedView.of_counts(*scene.rasterizer.sparse_class_pixel_counts(*what), count)
+            found = optional_products(scene.rasterizer).sparse_class_pixel_counts(*what)
+            return mask_tracking.TracedView.of_counts(*found, count)
 
         with scene.stage("Tracing Gaussians") as progress:
             views = list(each_view(len(scene.cameras), trace, progress))

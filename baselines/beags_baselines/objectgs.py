@@ -31,6 +31,7 @@ from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.preparation.refiner import AssignedScene, Refiner
 from beags_plugin.preparation.refiner_training import OwnTraining, Terms, TrainedScene
+from beags_plugin.rasterizers.optional import optional_products
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.system.errors import UserError, check_choice
 
@@ -98,7 +99,8 @@ class LabelledTraining(OwnTraining):
             labels = object_entropy.counted_labels(labels, carried, options.ignore_background)
             ranked = surfel_inputs(inputs.surfels, inputs.camera, sh_degree=0, class_ids=phi)
             ranked = replace(ranked, screen_shift=inputs.screen_shift)
-            blend = scene.rasterizer.class_channels(ranked, inputs.camera, scene.settings, len(self.ranks))
+            rasterizer = optional_products(scene.rasterizer)
+            blend = rasterizer.class_channels(ranked, inputs.camera, scene.settings, len(self.ranks))
             terms["classes"] = options.weight * object_entropy.label_entropy(blend, labels)
         if options.scale_weight > 0:
             logs = inputs.surfels.log_scales - math.log(scene.scale)  # in units of the input poses, as published

@@ -17,13 +17,14 @@ import torch
 from torch import Tensor
 
 from beags_baselines import instance_tracing as tracing
-from beags_plugin.assignment.contributions import contributions
+from beags_plugin.assignment.contributions import Product, contributions
 from beags_plugin.core.densification import Densified, split_by_sampling
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.preparation.refiner import Refiner
 from beags_plugin.preparation.refiner_training import Edit, OwnTraining, Terms, TrainedScene
+from beags_plugin.rasterizers.optional import optional_products
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.progress import each_view
@@ -102,15 +103,21 @@ class TraceTraining(OwnTraining):
         scene, surfels = self.scene, self.scene.surfels().detach()
         views = (surfels, scene.cameras, scene.labels, scene.rasterizer, scene.settings, self.num_classes)
         with scene.stage("Taking the objects") as progress:
-            class_ids, top, total = contributions(*views, progress, self.counts).largest()
+            class_ids, top, total = contributions(*views, progress, self._product()).largest()
         inside = tracing.members(top, total, self.options.member_share)
         return Membership(class_ids.int().masked_fill(~inside, 0))
+
+    def _product(self) -> Product:
+        """Return what is summed of a view: numbers of pixels, or their weights."""
+        rasterizer = self.scene.rasterizer
+        if self.counts:
+            return optional_products(rasterizer).sparse_class_pixel_counts
+        return rasterizer.sparse_class_contributions
 
     def _ambiguous(self, surfels: Surfels) -> Tensor:
         """Trace all views; return which Gaussians are ambiguous, [N] bool."""
         scene, options, inputs = self.scene, self.options, geometry_inputs(surfels)
-        rasterizer = scene.rasterizer
-        product = rasterizer.sparse_class_pixel_counts if self.counts else rasterizer.sparse_class_contributions
+        product = self._product()
         traced = tracing.InstanceTracing(len(surfels), surfels.means.device)
 
         def trace(view: int) -> tuple[Tensor, Tensor]:
@@ -124,11 +131,12 @@ class TraceTraining(OwnTraining):
     def _composited(self, edited: Densified) -> Densified:
         """Prune what no view composites at any pixel, labelled or not."""
         scene, inputs = self.scene, geometry_inputs(edited.surfels)
+        rasterizer = optional_products(scene.rasterizer)
 
         def trace(view: int) -> Tensor:
             camera = scene.cameras[view]
             one_class = torch.zeros(camera.height, camera.width, dtype=torch.int32, device=inputs.means.device)
-            return scene.rasterizer.sparse_class_pixel_counts(inputs, camera, scene.settings, one_class, 1)[0]
+            return rasterizer.sparse_class_pixel_counts(inputs, camera, scene.settings, one_class, 1)[0]
 
         with scene.stage("Tracing Gaussians") as progress, torch.no_grad():
             views = each_view(len(scene.cameras), trace, progress)
