@@ -62,7 +62,7 @@ def _is_theirs(kind: type) -> bool:
 def main() -> None:
     loose = [path.name for path in (ROOT / "beags_plugin").glob("*.py") if path.name != "__init__.py"]
     print(f"{lines('beags_plugin'):,} lines of Python in beags_plugin/, {len(loose)} loose files at its top")
-    print(f"{lines('tests'):,} lines of Python in tests/")
+    print(f"{lines('tests'):,} lines of Python in tests/, {lines('baselines'):,} in baselines/ with its tests")
     print("{} documents with {:,} words in docs/".format(*words()))
     try:
         found = options()

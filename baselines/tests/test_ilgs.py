@@ -145,6 +145,7 @@ def test_without_weight_or_mask_the_base_just_trains_on():
     assert all(torch.equal(a, b) for a, b in zip(before, unmasked.learned.learned, strict=True))
 
 
+@pytest.mark.slow("trains codes until they know the masks")
 def test_codes_learn_the_masks_and_leave_objects(capsys):
     training = trained(200, hull=False)
     found, scene = training.finish(), training.scene

@@ -39,6 +39,8 @@ from beags_plugin.runs.read import read_run
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.ply import read_vertices
 
+pytestmark = pytest.mark.slow("a training for each method")
+
 UNTRAINED = {
     "none": {},
     "flashsplat": {"gamma": -0.9},

@@ -13,6 +13,8 @@ from beags_plugin.runs.read import read_run
 from beags_plugin.runs.relocation import open_run
 from beags_plugin.system.reading.ply import read_vertices
 
+pytestmark = pytest.mark.slow("two trainings by ns-train")
+
 TRAIN = (
     "ns-train", "beags-tiny", "--vis", "tensorboard", "--machine.device-type", "cpu",
     "--optimizers.opacities.optimizer.lr", 0.5, "--pipeline.model.prepare.reprojection", "none",

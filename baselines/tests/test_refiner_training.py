@@ -20,6 +20,8 @@ from beags_plugin.objects.extract import extract_objects
 from beags_plugin.plugin.training import refinement
 from beags_plugin.runs.read import read_run
 
+pytestmark = pytest.mark.slow("a training for each choice of options")
+
 SURFELS, CLASS_IDS = discs()
 
 
