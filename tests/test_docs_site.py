@@ -99,6 +99,8 @@ def test_one_version_is_told_everywhere():
 
     version = tomllib.loads((ROOT / "pyproject.toml").read_text("utf8"))["project"]["version"]
     assert beags_plugin.__version__ == version
+    baselines = tomllib.loads((ROOT / "baselines/pyproject.toml").read_text("utf8"))
+    assert baselines["project"]["version"] == version
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text("utf8")
     assert re.findall(r"^## ([\d.]+)", (ROOT / "CHANGELOG.md").read_text("utf8"), re.MULTILINE)[0] == version
     pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
