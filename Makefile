@@ -68,6 +68,6 @@ format: setup
 
 # Leaves the environment (it may be shared), but makes the next setup build again.
 clean:
-	rm -rf build dist .cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf build dist baselines/build .cache .pytest_cache .ruff_cache .hypothesis
 	find . -path ./.venv -prune -o -name __pycache__ -type d -exec rm -rf {} +
 	rm -f "$(BEAGS_VENV)/.beags-source" "$(BEAGS_VENV)/.beags-joined"

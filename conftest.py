@@ -8,12 +8,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from cuda_backends import BACKENDS
+from every_backend import rasterizer  # noqa: F401
 from hypothesis import settings
 from shared_folders import shared_folder
 
 from beags_plugin.ops import extension
-from beags_plugin.rasterizers import RASTERIZERS
 
 settings.register_profile("beags", deadline=None)  # a busy machine is no failure
 settings.load_profile("beags")
@@ -78,15 +77,6 @@ def short_run(shared):
         run_to_end(short_config(write_scene(folder / "data"), folder / "run"))
 
     return shared("short_run", train)
-
-
-@pytest.fixture(params=["torch", "native", *BACKENDS])
-def rasterizer(request):
-    """Every backend in turn; one that cannot run here is skipped with its reason."""
-    backend = BACKENDS.get(request.param) or RASTERIZERS.get(request.param)
-    if reason := backend.unavailable():
-        pytest.skip(f"{request.param}: {reason}")
-    return backend()
 
 
 @pytest.fixture(params=["torch", "compiled"])

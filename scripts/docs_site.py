@@ -1,8 +1,8 @@
 """Write the sources of the documentation site: ``python scripts/docs_site.py [FOLDER]`` (build/docs/pages).
 
-They are README.md, CONTRIBUTING.md, CHANGELOG.md and docs/*.md with the files that they show, the notebook as a page,
-and a page of reference for each extension point: its interface and what is built in. zensical.toml builds a site of
-them (``make docs``).
+They are README.md, CONTRIBUTING.md, CHANGELOG.md, baselines/README.md and docs/*.md with the files that they show, the
+notebook as a page, and a page of reference for each extension point: its interface and what is built in. zensical.toml
+builds a site of them (``make docs``).
 Links to other files of the repository become links to its public address, ``Repository`` under ``[project.urls]`` of
 pyproject.toml; without one they become the file's path.
 """
@@ -25,7 +25,12 @@ else:
     import tomli as tomllib
 
 ROOT = Path(__file__).resolve().parents[1]
-PLACES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+PLACES = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+    "baselines/README.md": "baselines.md",
+}
 LINK = re.compile(r"(?P<before>!?\[(?P<text>[^\]]*)\]\()(?P<goal>[^)\s#]+)(?P<anchor>#[^)\s]*)?(?P<after>[^)]*\))")
 SOURCE = re.compile(r'(?P<before>src=")(?P<goal>[^"#]+)(?P<after>")')
 

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-CITING = ("beags_plugin", "tests", "benchmarks", "method_configs")
+CITING = ("beags_plugin", "baselines", "tests", "benchmarks", "method_configs")
 SUFFIXES = {".py", ".h", ".cpp", ".cu", ".cuh", ".toml", ".yaml", ".yml"}
-DOCUMENTS = [path for room in (".", "benchmarks", "docs", "notes") for path in sorted((ROOT / room).glob("*.md"))]
+ROOMS = (".", "baselines", "benchmarks", "docs", "notes")
+DOCUMENTS = [path for room in ROOMS for path in sorted((ROOT / room).glob("*.md"))]
 
 # "section 4", "sections 2, 3 and 5"; of other papers than ours only with dotted numbers ("sections 3.7.2, 4.4").
 CITATION = re.compile(r"\bsections?\s+(\d[\d.]*(?:(?:,\s*|,?\s+and\s+)\d[\d.]*)*)", re.IGNORECASE)

@@ -65,6 +65,7 @@ def test_every_registry_has_a_page_with_its_interface_and_what_is_built_in(pages
         ("README.md", '<img src="docs/images/pick.jpg">', '<img src="images/pick.jpg">', None),
         ("docs/viewer.md", "[a](../README.md#measured)", "[a](index.md#measured)", None),
         ("docs/viewer.md", "[a](../CONTRIBUTING.md)", "[a](contributing.md)", None),
+        ("docs/comparison.md", "[a](../baselines/README.md#options)", "[a](baselines.md#options)", None),
         ("docs/results.md", "[a](../notes/README.md)", "a (`notes/README.md`)", "[a](R/blob/HEAD/notes/README.md)"),
         ("docs/cuda.md", "[`Makefile`](../Makefile)", "`Makefile`", "[`Makefile`](R/blob/HEAD/Makefile)"),
         ("docs/cuda.md", "[a](https://b.c/d) [e](#f)", "[a](https://b.c/d) [e](#f)", None),
@@ -98,6 +99,8 @@ def test_one_version_is_told_everywhere():
 
     version = tomllib.loads((ROOT / "pyproject.toml").read_text("utf8"))["project"]["version"]
     assert beags_plugin.__version__ == version
+    baselines = tomllib.loads((ROOT / "baselines/pyproject.toml").read_text("utf8"))
+    assert baselines["project"]["version"] == version
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text("utf8")
     assert re.findall(r"^## ([\d.]+)", (ROOT / "CHANGELOG.md").read_text("utf8"), re.MULTILINE)[0] == version
     pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -16,10 +15,12 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.ops import extension
 from beags_plugin.ops.sparse_sums import SparseSums
-from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings, SurfelInputs
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import each_view
+
+Product = Callable[[SurfelInputs, Camera, RasterSettings, Tensor, int], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -66,23 +67,18 @@ def contributions(
     settings: RasterSettings,
     num_classes: int,
     progress: Callable[[int, int], None] | None = None,
-    counts: bool = False,
-    largest: tuple[int, int] | None = None,
+    product: Product | None = None,
 ) -> Contributions:
-    """Return C of the scene (E6), or with ``counts`` the numbers of pixels in place of the weights there.
+    """Return C of the scene (E6), or the sums of another product of its views.
 
-    largest: numbers ``most`` and ``within``, where of each pixel only the largest weights count; see
-    ``Rasterizer.sparse_top_contributions``.
-
+    product: takes and returns what ``Rasterizer.sparse_class_contributions``, the default, does.
     surfels: N Gaussians. labels: per camera [H, W] int32 class ids below ``num_classes`` or IGNORE, or None.
     Memory is linear in the (Gaussian, class) pairs that occur. Raises ``UserError`` for ids out of range.
     """
     settings = replace(settings, geometry=False, distortion=False)
     inputs = geometry_inputs(surfels)
     # float64, for thousands of small weights; sparse, as a table of all classes would be mostly zeros
-    product = rasterizer.sparse_class_pixel_counts if counts else rasterizer.sparse_class_contributions
-    if largest is not None:
-        product = partial(rasterizer.sparse_top_contributions, most=largest[0], within=largest[1])
+    product = product or rasterizer.sparse_class_contributions
     total = SparseSums() if extension.supports(surfels.means) else TorchSparseSums(surfels.means.device)
 
     def of_view(index: int) -> tuple[Tensor, Tensor]:

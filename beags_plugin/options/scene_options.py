@@ -52,11 +52,10 @@ class SceneOptions:
     """Length of base training for which all other steps and intervals of the base are stated; with another base_steps
     they are scaled in proportion. 0: they are taken as they are."""
     refiner: str = "bea"
-    """What happens after class assignment: bea (this method), none (assignment alone), another paper's method
-    (docs/refiners.md): flashsplat, gaussiancut, gaussian-grouping, trace3d, cob-gs, objectgs, sagd, dr-splat,
-    opengaussian, instascene, unified-lift, ilgs; or a registered one."""
+    """What happens after class assignment: bea (this method), none (assignment alone), or one that another
+    package registers, such as another paper's method (baselines/README.md)."""
     refiner_options: dict[str, bool | int | float | str] = field(default_factory=dict)
-    """Options of the refiner, as names and values in turn: docs/refiners.md."""
+    """Options of the refiner, as names and values in turn."""
     losses: dict[str, LossSpec] = field(default_factory=dict)
     """The terms of the training loss by name."""
     densify: DensifyConfig = field(default_factory=DensifyConfig)

@@ -29,6 +29,7 @@ from beags_plugin.rasterizers.autograd import (
     check_image,
 )
 from beags_plugin.rasterizers.interface import FLOATS, RasterSettings, SurfelInputs, map_ids
+from beags_plugin.rasterizers.optional import OptionalProducts
 from beags_plugin.rasterizers.pair_counts import PairCounts, capacity_for
 from beags_plugin.rasterizers.rendering import class_channels_by_threes
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
@@ -56,7 +57,7 @@ class _Frame:
     kept: tuple[Tensor | None, ...] = ()
 
 
-class CudaRasterizer(KernelRasterizer):
+class CudaRasterizer(KernelRasterizer, OptionalProducts):
     """Float32 and float64 on one GPU; the same bits in every run (there are no atomic additions of floats).
 
     In a CUDA graph (``torch.cuda.graph``) nothing is waited for. Render the same scene once before the capture, so
@@ -150,7 +151,7 @@ class CudaRasterizer(KernelRasterizer):
         num_classes: int,
         min_weight: float = 0.0,
     ) -> tuple[Tensor, Tensor]:
-        """See ``Rasterizer.sparse_class_pixel_counts``; there is no kernel: the torch reference counts, on the GPU."""
+        """See ``OptionalProducts.sparse_class_pixel_counts``; without a kernel: the torch reference, on the GPU."""
         labels = check_image("labels", labels, camera)
         return TorchRasterizer().sparse_class_pixel_counts(inputs, camera, settings, labels, num_classes, min_weight)
 
@@ -164,7 +165,7 @@ class CudaRasterizer(KernelRasterizer):
         most: int,
         within: int,
     ) -> tuple[Tensor, Tensor]:
-        """See ``Rasterizer.sparse_top_contributions``; there is no kernel: the torch reference sums, on the GPU."""
+        """See ``OptionalProducts.sparse_top_contributions``; without a kernel: the torch reference, on the GPU."""
         labels = check_image("labels", labels, camera)
         what = (inputs, camera, settings, labels, num_classes, most, within)
         return TorchRasterizer().sparse_top_contributions(*what)
@@ -189,7 +190,7 @@ class CudaRasterizer(KernelRasterizer):
     def class_channels(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
     ) -> Tensor:
-        """See ``Rasterizer.class_channels``; without a kernel: three classes at a time."""
+        """See ``OptionalProducts.class_channels``; without a kernel: three classes at a time."""
         return class_channels_by_threes(self, inputs, camera, settings, num_classes)
 
     @torch.no_grad()

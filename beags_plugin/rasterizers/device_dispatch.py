@@ -7,10 +7,11 @@ from typing import Any
 from torch import Tensor
 
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, SurfelInputs
+from beags_plugin.rasterizers.optional import OptionalProducts, optional_products
 
 
-class DeviceDispatchRasterizer(Rasterizer):
-    """Hands every call to one of two backends, by the device of the surfels; see ``Rasterizer`` for the methods.
+class DeviceDispatchRasterizer(Rasterizer, OptionalProducts):
+    """Hand every call of ``Rasterizer`` and ``OptionalProducts`` to one of two backends, by the surfels' device.
 
     cpu, gpu: the two backends, both of which can run.
     """
@@ -35,16 +36,16 @@ class DeviceDispatchRasterizer(Rasterizer):
         return self._backend(inputs).sparse_class_contributions(inputs, *args, **kwargs)
 
     def sparse_class_pixel_counts(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
-        return self._backend(inputs).sparse_class_pixel_counts(inputs, *args, **kwargs)
+        return optional_products(self._backend(inputs)).sparse_class_pixel_counts(inputs, *args, **kwargs)
 
     def sparse_top_contributions(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
-        return self._backend(inputs).sparse_top_contributions(inputs, *args, **kwargs)
+        return optional_products(self._backend(inputs)).sparse_top_contributions(inputs, *args, **kwargs)
 
     def class_map(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
         return self._backend(inputs).class_map(inputs, *args, **kwargs)
 
     def class_channels(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> Tensor:
-        return self._backend(inputs).class_channels(inputs, *args, **kwargs)
+        return optional_products(self._backend(inputs)).class_channels(inputs, *args, **kwargs)
 
     def feature_channels(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> Tensor | None:
         return self._backend(inputs).feature_channels(inputs, *args, **kwargs)

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.system.errors import UserError
 
 MIN_ALPHA = 1.0 / 255.0  # weaker contributions are skipped: they are invisible in 8 bits
 LARGEST = 1e18  # world units: surfels larger, or further off in depth, count as broken; their squares overflow float32
@@ -130,9 +129,8 @@ class RasterOutputs:
 class Rasterizer(ABC):
     """One backend. All its methods render surfels with the same weights w_i.
 
-    A backend writes the five abstract methods. Pixel counts, largest contributions and class channels are for some
-    refiners of other papers alone: without them these say which backend to take. Instances hold no scene; they may be
-    kept for the life of the program.
+    A backend writes the five abstract methods; what else some refiners of other packages ask for is in
+    ``rasterizers.optional``. Instances hold no scene; they may be kept for the life of the program.
     """
 
     @classmethod
@@ -177,39 +175,6 @@ class Rasterizer(ABC):
             lambda slots, count: self.class_contributions(inputs, camera, settings, slots, count), labels, num_classes
         )
 
-    def sparse_class_pixel_counts(
-        self,
-        inputs: SurfelInputs,
-        camera: Camera,
-        settings: RasterSettings,
-        labels: Tensor,  # [H, W] int32 class ids, or IGNORE
-        num_classes: int,
-        min_weight: float = 0.0,
-    ) -> tuple[Tensor, Tensor]:
-        """Return the numbers of pixels u with labels(u) = c and w_i(u) > min_weight that are not zero.
-
-        They are keys [M] int64 as in ``sparse_class_contributions``, and counts [M] int32. A hidden surfel counts too
-        until compositing stops before it. No gradient.
-        """
-        raise self._lacks("pixel counts")
-
-    def sparse_top_contributions(
-        self,
-        inputs: SurfelInputs,
-        camera: Camera,
-        settings: RasterSettings,
-        labels: Tensor,  # [H, W] int32 class ids, or IGNORE
-        num_classes: int,
-        most: int,
-        within: int,
-    ) -> tuple[Tensor, Tensor]:
-        """Return ``sparse_class_contributions`` where of each pixel only the ``most`` largest w_i count.
-
-        They are chosen, of equal ones the nearer, among the first ``within`` (at least 1, as ``most``) that the pixel
-        has. No gradient.
-        """
-        raise self._lacks("largest contributions")
-
     @abstractmethod
     def class_map(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
@@ -219,16 +184,6 @@ class Rasterizer(ABC):
         Returns ([H, W] int32, background 0 where nothing is; [H, W] float, the winner's share of A, 0 there). No
         gradient.
         """
-
-    def class_channels(
-        self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
-    ) -> Tensor:
-        """Return [H, W, num_classes], p_c = sum_i w_i [phi_i = c], differentiable in the inputs but their colours.
-
-        A backend should take the same time for any number of classes if it can, as dL/dw_i is dL/dp at phi_i; else
-        ``rendering.class_channels_by_threes`` does it.
-        """
-        raise self._lacks("class channels")
 
     def feature_channels(
         self, inputs: SurfelInputs, features: Tensor, camera: Camera, settings: RasterSettings
@@ -242,12 +197,6 @@ class Rasterizer(ABC):
     @abstractmethod
     def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
         """Return [H, W] int32, the index of the surfel with the largest w_i (ties to the nearer); -1 where none is."""
-
-    def _lacks(self, what: str) -> UserError:
-        return UserError(
-            f"the rasterizer {type(self).__name__} has no {what}, which this refiner needs: train with "
-            "--pipeline.model.rasterizer native or torch."
-        )
 
 
 def sparse_table(table: Callable[[Tensor, int], Tensor], labels: Tensor, num_classes: int) -> tuple[Tensor, Tensor]:

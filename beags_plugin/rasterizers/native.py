@@ -22,6 +22,7 @@ from beags_plugin.rasterizers.autograd import (
     check_image,
 )
 from beags_plugin.rasterizers.interface import FLOATS, RasterSettings, SurfelInputs, map_ids
+from beags_plugin.rasterizers.optional import OptionalProducts
 from beags_plugin.system.errors import UserError
 
 
@@ -67,7 +68,7 @@ def _module() -> ModuleType:
     return module
 
 
-class NativeRasterizer(KernelRasterizer):
+class NativeRasterizer(KernelRasterizer, OptionalProducts):
     """Float32 and float64 on the CPU, on ``torch.get_num_threads()`` threads; the same bits for any number of them."""
 
     @classmethod
@@ -130,7 +131,7 @@ class NativeRasterizer(KernelRasterizer):
         num_classes: int,
         min_weight: float = 0.0,
     ) -> tuple[Tensor, Tensor]:
-        """See ``Rasterizer.sparse_class_pixel_counts``; in float32, counts are exact up to 2^24."""
+        """See ``OptionalProducts.sparse_class_pixel_counts``; in float32, counts are exact up to 2^24."""
         inputs = inputs.checked().detached()
         labels = check_image("labels", labels, camera)
         frame, _ = _frame(inputs, camera, settings)
@@ -149,7 +150,7 @@ class NativeRasterizer(KernelRasterizer):
         most: int,
         within: int,
     ) -> tuple[Tensor, Tensor]:
-        """See ``Rasterizer.sparse_top_contributions``."""
+        """See ``OptionalProducts.sparse_top_contributions``."""
         inputs = inputs.checked().detached()
         labels = check_image("labels", labels, camera)
         frame, _ = _frame(inputs, camera, settings)
@@ -172,7 +173,7 @@ class NativeRasterizer(KernelRasterizer):
     def class_channels(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
     ) -> Tensor:
-        """See ``Rasterizer.class_channels``."""
+        """See ``OptionalProducts.class_channels``."""
         inputs = inputs.checked()
         map_ids(inputs, num_classes)
         return _channels(inputs, camera, settings, num_classes, None)

@@ -92,7 +92,7 @@ def draw_features(
 def class_channels_by_threes(
     rasterizer: Rasterizer, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
 ) -> Tensor:
-    """Do what ``Rasterizer.class_channels`` says by ``draw_features``, for backends that have nothing faster."""
+    """Do what ``OptionalProducts.class_channels`` says by ``draw_features``, for backends that have nothing faster."""
     one_hot = torch.nn.functional.one_hot(map_ids(inputs, num_classes).long(), num_classes)
     return draw_features(rasterizer, inputs, one_hot.to(inputs.means), camera, settings)
 

@@ -21,6 +21,7 @@ from beags_plugin.rasterizers.interface import (
     map_ids,
     sparse_table,
 )
+from beags_plugin.rasterizers.optional import OptionalProducts
 from beags_plugin.rasterizers.reference_geometry import ProjectedSurfels, hits, on_screen, project
 from beags_plugin.rasterizers.rendering import class_channels_by_threes
 
@@ -47,7 +48,7 @@ class _Block:
     after: Tensor
 
 
-class TorchRasterizer(Rasterizer):
+class TorchRasterizer(Rasterizer, OptionalProducts):
     """Autograd through dense blocks: slow, exact in float64, on any device.
 
     smooth_cutoff: fade alpha out at 1/255 instead of cutting it, so that finite differences hold; for tests.

@@ -12,25 +12,20 @@ from beags_plugin.system.registry import Registry
 if TYPE_CHECKING:
     from beags_plugin.preparation.refiner import Refiner
 
+BASELINES = (
+    *("cob-gs", "dr-splat", "flashsplat", "gaussian-grouping", "gaussiancut", "ilgs", "instascene", "objectgs"),
+    *("opengaussian", "sagd", "trace3d", "unified-lift"),
+)
+"""Methods of other papers, in a distribution of their own."""
+
 REFINERS = Registry(
     "refiner",
     "beags.refiners",
     {
         "bea": "beags_plugin.refiners.bea:BeaRefiner",
         "none": "beags_plugin.refiners.none:NoRefiner",
-        "flashsplat": "beags_plugin.refiners.flashsplat:FlashSplatRefiner",
-        "cob-gs": "beags_plugin.refiners.cob_gs:CobGsRefiner",
-        "trace3d": "beags_plugin.refiners.trace3d:Trace3DRefiner",
-        "gaussiancut": "beags_plugin.refiners.gaussiancut:GaussianCutRefiner",
-        "gaussian-grouping": "beags_plugin.refiners.gaussian_grouping:GaussianGroupingRefiner",
-        "objectgs": "beags_plugin.refiners.objectgs:ObjectGsRefiner",
-        "dr-splat": "beags_plugin.refiners.dr_splat:DrSplatRefiner",
-        "opengaussian": "beags_plugin.refiners.opengaussian:OpenGaussianRefiner",
-        "sagd": "beags_plugin.refiners.sagd:SagdRefiner",
-        "instascene": "beags_plugin.refiners.instascene:InstaSceneRefiner",
-        "ilgs": "beags_plugin.refiners.ilgs:IlgsRefiner",
-        "unified-lift": "beags_plugin.refiners.unified_lift:UnifiedLiftRefiner",
     },
+    elsewhere=dict.fromkeys(BASELINES, "pip install ./baselines"),
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
@@ -20,13 +21,16 @@ class Registry:
 
     kind: the user's word for an entry ("rasterizer"). group: the entry-point group in which other packages add their
     own, e.g. ``beags.rasterizers``. builtin: name to spec of this package's own; an entry point of the same name is
-    refused.
+    refused. elsewhere: name to the command that installs the distribution which has it.
     """
 
-    def __init__(self, kind: str, group: str, builtin: dict[str, str]) -> None:
+    def __init__(
+        self, kind: str, group: str, builtin: dict[str, str], elsewhere: Mapping[str, str] | None = None
+    ) -> None:
         self.kind = kind
         self.group = group
         self._specs = dict(builtin)
+        self._elsewhere = elsewhere or {}
         self._discovered = False
 
     def _discover(self) -> None:
@@ -51,6 +55,10 @@ class Registry:
 
     def check(self, name: str, *besides: str) -> None:
         """Raise ``UserError`` unless ``name`` is registered, or one of the words ``besides``; imports nothing."""
+        if name in self._elsewhere and name not in self.names():
+            raise UserError(
+                f"the {self.kind} {name!r} is not part of beags itself: run {self._elsewhere[name]} in a clone of it."
+            )
         check_choice(name, [*besides, *self.names()], self.kind)
 
     def get(self, name: str) -> Any:

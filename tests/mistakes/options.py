@@ -20,18 +20,26 @@ def model(flag: str, value: str) -> Callable[[Place], Any]:
     return trained(f"--pipeline.model.{flag}", value)
 
 
-def refiner(name: str, *options: str) -> Callable[[Place], Any]:
-    return trained("--pipeline.model.refiner", name, "--pipeline.model.refiner-options", *options)
+def refiner(name: str) -> Callable[[Place], Any]:
+    """Return the mistake to name a refiner where no other package adds any."""
+
+    def make(at: Place):
+        from beags_plugin.refiners import REFINERS
+
+        own = {each: spec for each, spec in REFINERS._specs.items() if spec.startswith("beags_plugin.")}
+        at.patch.setattr(REFINERS, "_specs", own)
+        at.patch.setattr(REFINERS, "_discovered", True)
+        return at.train("--pipeline.model.refiner", name)
+
+    return make
 
 
 mistakes(
     "options",
     {
         "an unknown backend": model("rasterizer", "vulkan"),
-        "an unknown refiner": model("refiner", "magic"),
-        "an object that no class is": refiner("cob-gs", "object", "cap"),
-        "epochs that end with a phase of colours": refiner("cob-gs", "epochs", "12"),
-        "objects that could share their Gaussians": refiner("trace3d", "member_share", "0.3"),
+        "an unknown refiner": refiner("magic"),
+        "a refiner of a package that is not installed": refiner("flashsplat"),
         "an unknown reprojection": model("prepare.reprojection", "guess"),
         "an unknown kind of depth": model("prepare.depth", "mean"),
         "negative steps of refinement": model("refine-steps", "-5"),

@@ -5,7 +5,10 @@ from __future__ import annotations
 import pytest
 from raster_scenes import CLASSES, make_scene
 
+from beags_plugin.rasterizers import RASTERIZERS
+from beags_plugin.rasterizers.device_dispatch import DeviceDispatchRasterizer
 from beags_plugin.rasterizers.interface import Rasterizer
+from beags_plugin.rasterizers.optional import OptionalProducts, optional_products
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 from beags_plugin.system.errors import UserError
 
@@ -30,12 +33,9 @@ def test_a_backend_writes_five_methods_and_has_the_products_of_assignment(backen
 
 
 def test_what_it_lacks_is_said_where_a_refiner_asks_for_it(backend):
-    scene = make_scene()
-    what = (scene.inputs, scene.camera, scene.settings)
-    sentence = "the rasterizer Five has no {}, which this refiner needs: train with --pipeline.model.rasterizer native"
-    with pytest.raises(UserError, match=sentence.format("pixel counts")):
-        backend.sparse_class_pixel_counts(*what, scene.target, CLASSES)
-    with pytest.raises(UserError, match=sentence.format("largest contributions")):
-        backend.sparse_top_contributions(*what, scene.target, CLASSES, 2, 9)
-    with pytest.raises(UserError, match=sentence.format("class channels")):
-        backend.class_channels(*what, CLASSES)
+    sentence = "the rasterizer Five lacks products that this refiner needs: train with --pipeline.model.rasterizer nat"
+    with pytest.raises(UserError, match=sentence):
+        optional_products(backend)
+    with pytest.raises(UserError, match=sentence):
+        DeviceDispatchRasterizer(backend, backend).class_channels(make_scene().inputs)
+    assert all(issubclass(RASTERIZERS.get(name), OptionalProducts) for name in ("cuda", "native", "torch"))

@@ -13,6 +13,7 @@ from torch import Tensor
 from beags_plugin.ops import cuda_extension
 from beags_plugin.rasterizers.cuda import CudaRasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, SurfelInputs
+from beags_plugin.rasterizers.optional import OptionalProducts
 
 
 def emulation() -> ModuleType | None:
@@ -52,7 +53,7 @@ class EmulatedCudaRasterizer(CudaRasterizer):
         return None if emulation() else "beags_plugin._cuda_emulation was not built (BEAGS_CUDA_EMULATION=ON)"
 
 
-class CudaOnCpuTensors(Rasterizer):
+class CudaOnCpuTensors(Rasterizer, OptionalProducts):
     """The CUDA rasterizer behind CPU tensors, so that the bodies of all tests run on it as they are."""
 
     def __init__(self) -> None:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import re
 from types import SimpleNamespace
 
 import pytest
-from places import ROOT
 
 from beags_plugin.losses.occupancy import OccupancyLoss
 from beags_plugin.losses.photometric import PhotometricLoss
@@ -38,25 +36,6 @@ def test_a_reprojection_of_another_package_that_does_not_load(monkeypatch):
 def test_wrong_options_of_a_loss(kind, name, value, limits):
     with pytest.raises(UserError, match=f"{name} = {value}: it must {limits}"):
         kind(**{name: value})
-
-
-def test_the_documented_flags_choose_a_refiner_and_its_options():
-    pytest.importorskip("nerfstudio")
-    import tyro
-
-    from beags_plugin.plugin.options.config import BeagsTrainerConfig
-    from beags_plugin.plugin.presets import load_preset
-    from beags_plugin.refiners import make_refiner
-    from beags_plugin.refiners.trace3d import Trace3DRefiner
-
-    command = re.search(
-        r"^    ns-train beags --data X (.*?)\n\n", (ROOT / "docs/refiners.md").read_text("utf8"), re.M | re.S
-    )
-    assert command is not None
-    parser, preset = tyro.conf.FlagConversionOff[BeagsTrainerConfig], load_preset("beags").config
-    model = tyro.cli(parser, args=command[1].replace("\\\n", " ").split(), default=preset).pipeline.model
-    assert make_refiner(model.refiner, model.refiner_options) == Trace3DRefiner(min_pixels=25)
-    assert model.prepare.reprojection == "none"
 
 
 @pytest.mark.parametrize("refine_steps", [0, 10])

@@ -1,0 +1,296 @@
+"""OpenGaussian as a refiner: features of a frozen base, codebooks of them, and classes of their leaves.
+
+The steps have three stages (``instance_features``). In the first, a quarter, features agree within masks and differ
+between them. In the second, a quarter, k-means of features and positions makes ``coarse`` clusters, which are drawn
+with the features of their centres and pulled towards the masks' means. In the third the features of one cluster after
+the other are clustered again, into leaves, and pulled alike with the cluster drawn alone. In the end each leaf, drawn
+alone in every view, is matched with a mask (``leaf_labels``).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import log
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import embedding
+
+from beags_baselines import instance_features as parts
+from beags_baselines import leaf_labels
+from beags_baselines.isolated_render import FrozenDrawing
+from beags_plugin.core.membership import Membership
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.class_ranks import ClassRanks
+from beags_plugin.losses.base import LossInputs
+from beags_plugin.preparation.refiner import Refiner
+from beags_plugin.preparation.refiner_training import Edit, OwnTraining, Terms, TrainedScene
+from beags_plugin.system.errors import UserError, check_choice
+from beags_plugin.system.progress import say
+
+FULL_STEPS = 40_000
+FASTEST = 10.0  # bound of the factor of the rates in short runs
+RATES = (1e-3, 1e-4, 1e-3)  # of the features by stage: Adam with eps 1e-15
+COARSE_INTERVAL, FINE_INTERVAL, TURN = 200, 50, 300  # steps of 40,000: between updates, and for a cluster
+LEAST_SIZE = 1e-3  # factor of the sizes of a draw
+SHOWS = 0.8  # largest alpha of what is drawn alone, above which it shows in a view
+CLUSTER_SILHOUETTE, LEAF_SILHOUETTE = 0.9, 0.8  # alpha alone
+VIEWS, FEATURES, COARSE, FINE, SIZES = range(5)  # purposes of random numbers
+
+
+@dataclass(frozen=True)
+class OpenGaussianRefiner(Refiner):
+    """Gives leaves of Gaussians the class of the masks that they look like; a Gaussian has one class or none."""
+
+    coarse: int = 64
+    """Clusters."""
+    fine: int = 10
+    """The most leaves of a cluster."""
+    position_weight: float = 0.5
+    """Weight of positions beside features."""
+    cohesion_weight: float = 0.1
+    """Weight of agreement within masks."""
+    exclude_dropped: bool = False
+    """Leaves out masks whose features disagree."""
+    min_gaussians: int = 100
+    """Gaussians by which a cluster shows in a view; small scenes need fewer."""
+    max_scale: float = 0.5
+    """Largest size of these, units of the input poses."""
+    rule: str = leaf_labels.RULES[0]
+    """Rule of extraction: classes or query."""
+    min_views: int = leaf_labels.MIN_VIEWS
+    """Matches that a leaf needs."""
+    min_leaf: int = leaf_labels.MIN_LEAF
+    """Visible Gaussians of a leaf."""
+
+    def __post_init__(self) -> None:
+        check_choice(self.rule, leaf_labels.RULES, "rule of extraction")
+        for name in ("coarse", "fine", "min_gaussians", "min_views", "min_leaf"):
+            if (value := getattr(self, name)) < 1:
+                raise UserError(f"{name} is {value}: give a number, 1 or more.")
+        for name in ("position_weight", "cohesion_weight"):
+            if not 0.0 <= (value := getattr(self, name)) < float("inf"):
+                raise UserError(f"{name} is {value:g}: give a weight, 0 or more.")
+        if not self.max_scale > 0.0:
+            raise UserError(f"max_scale is {self.max_scale:g}: give a length above 0, or inf.")
+
+    def steps(self, asked: int, views: int, objects: int) -> int:
+        return asked
+
+    def own_training(self, scene: TrainedScene) -> OwnTraining:
+        return CodebookTraining(scene, self)
+
+
+class CodebookTraining(OwnTraining):
+    """Trains a feature of each Gaussian; the scene stays as it is."""
+
+    def __init__(self, scene: TrainedScene, options: OpenGaussianRefiner) -> None:
+        self.scene, self.options = scene, options
+        self.drawing = FrozenDrawing(scene)
+        count, device = len(self.drawing), self.drawing.inputs.means.device
+        self.ranks = ClassRanks(torch.tensor(list(scene.names), device=device))
+        self.masked = [view for view, labels in enumerate(scene.labels) if bool((labels != IGNORE).any())]
+        first = torch.rand(count, parts.CHANNELS, generator=scene.generator(0, FEATURES))
+        self.features = first.to(device).requires_grad_()
+        self.adam = torch.optim.Adam([self.features], eps=1e-15)
+        self.starts = (0, scene.steps // 4, scene.steps // 2)  # of the stages
+        share = scene.steps / FULL_STEPS
+        fine_steps = scene.steps - self.starts[2]
+        self.turn_steps = min(TURN, max(fine_steps // options.coarse, 1))
+        self.coarse_interval = max(round(COARSE_INTERVAL * min(share, 1.0)), 1)
+        self.fine_interval = max(round(FINE_INTERVAL * self.turn_steps / TURN), 1)
+        self.masks = parts.PseudoMasks.none(self.features)
+        whole, (k1, k2) = torch.zeros(count, dtype=torch.int64, device=device), (options.coarse, options.fine)
+        self.book = parts.Codebook(
+            coarse=first.new_zeros(k1, parts.CHANNELS + 3, device=device),
+            clusters=whole,
+            fine=first.new_zeros(k1, k2, parts.CHANNELS, device=device),
+            leaves=torch.full_like(whole, k1 * k2),
+            used=whole.new_ones(k1),
+            occurs=whole.new_zeros(len(scene.cameras), k1).bool(),
+        )
+
+    def stage(self, step: int) -> int:
+        """Return the stage of a step, 0 to 2."""
+        return sum(step >= start for start in self.starts) - 1
+
+    def rates(self, step: int) -> Mapping[str, float]:
+        return {}
+
+    def before_step(self, step: int) -> Edit | None:
+        self.adam.param_groups[0]["lr"] = min(FULL_STEPS / self.scene.steps, FASTEST) * RATES[self.stage(step)]
+        self.adam.zero_grad()
+        book, (_, second, third) = self.book, self.starts
+        if step == second:
+            self._take_pseudo_masks()
+            generator = self.scene.generator(step, COARSE)
+            book.coarse = parts.first_centres(self._vectors(), self.options.coarse, generator)
+        if step == second or (second < step < third and (step - second) % self.coarse_interval == 0):
+            book.coarse, book.clusters = parts.lloyd(self._vectors(), book.coarse)
+        if step == third:
+            self._begin_leaves(self.scene.generator(step, FINE))
+        if step >= third:
+            place, cluster = self._turn(step)
+            if place % self.fine_interval == 0:
+                self._update_leaves(cluster)
+        return None
+
+    def terms(self, inputs: LossInputs, step: int, base: Callable[[], Terms]) -> Terms:
+        if not self.masked:
+            return {}
+        view, stage, size = self._view(step), self.stage(step), self._size(step)
+        masks, labels = self._masks(view), self.masks.of(view)
+        if stage == 0:
+            return self._first_terms(view, masks, late=2 * step >= self.starts[1])
+        book, options, own = self.book, self.options, None
+        if stage == 1:
+            centres = book.coarse[:, : parts.CHANNELS][book.clusters]
+        else:
+            _, cluster = self._turn(step)
+            own = (book.clusters == cluster).nonzero()[:, 0]
+            if not bool(book.occurs[view, cluster]) or len(own) == 0:
+                return {}
+            centres = book.fine.flatten(0, 1)[book.leaves[own]]
+        features = self.features if own is None else embedding(own, self.features)
+        quantised = parts.drawn_form(parts.straight_through(features, centres))
+        drawn, alpha = self.drawing.draw(view, quantised, own, size)
+        if own is not None and not bool((alpha > SHOWS).any()):
+            return {}
+        loss = parts.label_loss(drawn, alpha, masks, labels, own is not None, options.exclude_dropped)
+        return {"clusters" if own is None else "leaves": loss}
+
+    def _first_terms(self, view: int, masks: parts.MaskedPixels, late: bool) -> Terms:
+        drawn, alpha = self.drawing.draw(view, parts.drawn_form(self.features))
+        means = masks.means(drawn, alpha > parts.SOLID)
+        close = parts.cohesion(drawn, means, masks)
+        return {"cohesion": self.options.cohesion_weight * close, "separation": parts.separation(means, late)}
+
+    def _view(self, step: int) -> int:
+        """Return the view of a step: all that have a mask, in a new order each time."""
+        number, place = divmod(step, len(self.masked))
+        order = torch.randperm(len(self.masked), generator=self.scene.generator(number, VIEWS))
+        return self.masked[int(order[place])]
+
+    def _size(self, step: int) -> float:
+        """Return the factor of the sizes of all Gaussians in a step: 1 in half of them."""
+        shrinks, factor = torch.rand(2, generator=self.scene.generator(step, SIZES)).tolist()
+        return max(factor, LEAST_SIZE) if shrinks < 0.5 else 1.0
+
+    def _turn(self, step: int) -> tuple[int, int]:
+        """Return the step's place within the turn of a cluster, and the cluster."""
+        turns, place = divmod(step - self.starts[2], self.turn_steps)
+        return place, turns % self.options.coarse
+
+    def _masks(self, view: int) -> parts.MaskedPixels:
+        labels = self.scene.labels[view].to(self.features.device)
+        return parts.MaskedPixels.of(self.ranks.ranked_labels(labels))
+
+    def _vectors(self) -> Tensor:
+        """Return [N, 9], features beside weighted positions in units of the input poses."""
+        positions = self.drawing.inputs.means * (self.options.position_weight / self.scene.scale)
+        return torch.cat([self.features.detach(), positions], dim=1)
+
+    @torch.no_grad()
+    def _take_pseudo_masks(self) -> None:
+        found, shown = [], parts.drawn_form(self.features)
+        with self.scene.stage("Averaging features") as progress:
+            for done, view in enumerate(self.masked, start=1):
+                drawn, _ = self.drawing.draw(view, shown)
+                found.append(parts.PseudoMasks.of_view(view, drawn, self._masks(view)))
+                progress(done, len(self.masked))
+        self.masks = parts.PseudoMasks.joined(found) if found else self.masks
+
+    @torch.no_grad()
+    def _begin_leaves(self, generator: torch.Generator) -> None:
+        """Find in which views each cluster shows, and how many leaves it gets; choose centres from the whole scene."""
+        self._take_pseudo_masks()
+        book, options, drawing = self.book, self.options, self.drawing
+        largest = drawing.inputs.log_scales.max(dim=1).values
+        small = largest < log(options.max_scale * self.scene.scale)
+        shown, seen = parts.drawn_form(self.features), torch.zeros_like(book.used)
+        with self.scene.stage("Counting leaves") as progress:
+            for done, view in enumerate(self.masked, start=1):
+                usable = small & drawing.visible(view)
+                masks, labels = self._masks(view), self.masks.of(view)
+                counts = torch.bincount(book.clusters[usable], minlength=options.coarse)
+                for cluster in (counts >= options.min_gaussians).nonzero()[:, 0].tolist():
+                    own = (usable & (book.clusters == cluster)).nonzero()[:, 0]
+                    drawn, alpha = drawing.draw(view, shown[own], own)
+                    if bool((alpha > SHOWS).any()):
+                        found = parts.fine_clusters(drawn, alpha > CLUSTER_SILHOUETTE, masks, labels)
+                        book.occurs[view, cluster] = found > 0
+                        seen[cluster] = max(int(seen[cluster]), found)
+                progress(done, len(self.masked))
+        book.used = (seen.clamp_min(1) + 1).clamp_max(options.fine)
+        chosen = torch.randint(len(drawing), (options.coarse * options.fine,), generator=generator)
+        book.fine = self.features.detach()[chosen.to(shown.device)].view(options.coarse, options.fine, -1)
+
+    def _update_leaves(self, cluster: int) -> None:
+        book, used = self.book, int(self.book.used[cluster])
+        own = (book.clusters == cluster).nonzero()[:, 0]
+        if len(own):
+            book.fine[cluster, :used], local = parts.lloyd(self.features.detach()[own], book.fine[cluster, :used])
+            book.leaves[own] = cluster * self.options.fine + local
+
+    def after_step(self, step: int) -> Edit | None:
+        if self.features.grad is not None:
+            self.adam.step()
+        return None
+
+    @torch.no_grad()
+    def finish(self) -> Membership:
+        options, leaves, votes = self.options, self.book.leaves, self._votes()
+        shown = torch.zeros_like(self.scene.class_ids())
+        if options.rule == "classes":
+            table = shown.new_zeros(options.coarse * options.fine + 1)  # the last: in no leaf
+            named = leaf_labels.classes_of_leaves(votes, options.min_views)
+            for leaf, rank in named.items():
+                table[leaf] = self.ranks.ids[rank]
+            inside = float(torch.isin(leaves, leaves.new_tensor(list(named))).double().mean())
+            like = f"{len(named)} of {len(torch.unique(leaves))} look like a mask in {options.min_views} views or more"
+            say(f"  leaves: {like}; they hold {inside:.0%} of the Gaussians, and the others have no class")
+            return Membership(table[leaves])
+        masks, surfels, centres = {}, self.scene.surfels().detach(), self.book.fine.flatten(0, 1)
+        for rank, class_id in enumerate(self.ranks.ids.tolist()):
+            if class_id != 0:
+                wanted = leaf_labels.queried_leaves(votes, rank, centres, options.fine)
+                chosen = torch.isin(leaves, leaves.new_tensor(wanted))
+                masks[class_id] = leaf_labels.queried_object(surfels, chosen, self.scene.scale, options.min_gaussians)
+        return Membership.of_masks(masks, shown)
+
+    def _votes(self) -> leaf_labels.Votes:
+        """Draw every leaf alone in every view in which its cluster shows; return what it looks like there."""
+        book, drawing, options = self.book, self.drawing, self.options
+        shown, votes = parts.drawn_form(self.features), {}
+        with self.scene.stage("Matching leaves") as progress:
+            for done, view in enumerate(self.masked, start=1):
+                visible, masks, labels = drawing.visible(view), self._masks(view), self.masks.of(view)
+                counts = torch.bincount(book.leaves[visible], minlength=options.coarse * options.fine + 1)[:-1]
+                occurs = book.occurs[view].repeat_interleave(options.fine)
+                for leaf in ((counts >= options.min_leaf) & occurs).nonzero()[:, 0].tolist():
+                    own = (book.leaves == leaf).nonzero()[:, 0]
+                    drawn, alpha = drawing.draw(view, shown[own], own)
+                    place = parts.matched_mask(drawn, alpha > LEAF_SILHOUETTE, masks, labels)
+                    if place is not None:
+                        votes.setdefault(leaf, Counter())[int(masks.classes[place])] += 1
+                progress(done, len(self.masked))
+        return votes
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "features": self.features.detach(),
+            "adam": self.adam.state_dict(),
+            "masks": dict(vars(self.masks)),
+            "book": dict(vars(self.book)),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        device = self.features.device
+        with torch.no_grad():
+            self.features.copy_(state["features"])
+        self.adam.load_state_dict(state["adam"])
+        self.masks = parts.PseudoMasks(**{name: values.to(device) for name, values in state["masks"].items()})
+        self.book = parts.Codebook(**{name: values.to(device) for name, values in state["book"].items()})

@@ -1,0 +1,152 @@
+"""Unified-Lift as a refiner: codes and a codebook of objects learn on the base, which stays (``object_codebook``).
+
+The source trains both beside the scene; as their terms leave its geometry alone, training them after it differs by the
+start alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from beags_baselines import identity_codes, object_codebook
+from beags_baselines.learned_codes import LearnedCodes
+from beags_plugin.core.membership import Membership
+from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.class_ranks import ClassRanks
+from beags_plugin.losses.base import LossInputs
+from beags_plugin.preparation.refiner import Refiner
+from beags_plugin.preparation.refiner_training import Edit, OwnTraining, Terms, TrainedScene
+from beags_plugin.system.errors import UserError, check_choice
+from beags_plugin.system.progress import say
+
+SAMPLES = 0  # purpose of random numbers
+
+
+@dataclass(frozen=True)
+class UnifiedLiftRefiner(Refiner):
+    """Cuts every object out of the base by the codes of the codebook that are its own."""
+
+    codes: int = object_codebook.CODES
+    """Codes of the codebook, at least one for each class."""
+    rule: str = object_codebook.RULES[0]
+    """Rule of objects: softmax or argmax."""
+    threshold: float = identity_codes.THRESHOLD
+    """Least probability of an object (softmax)."""
+    hull: bool = identity_codes.HULL
+    """Gaussians inside the object's hull join it (softmax)."""
+
+    def __post_init__(self) -> None:
+        check_choice(self.rule, object_codebook.RULES, "rule of objects")
+        if self.codes < 2:
+            raise UserError(f"codes is {self.codes}: give a number of codes, 2 or more.")
+        if not 0.0 <= self.threshold < 1.0:
+            raise UserError(f"threshold is {self.threshold:g}: give a probability, from 0 to below 1.")
+
+    def check(self, names: Mapping[int, str]) -> None:
+        if self.codes < len(names):
+            raise UserError(f"codes is {self.codes}, but there are {len(names)} classes: give as many codes at least.")
+
+    def steps(self, asked: int, views: int, objects: int) -> int:
+        return asked
+
+    def own_training(self, scene: TrainedScene) -> OwnTraining:
+        return CodebookTraining(scene, self)
+
+
+class CodebookTraining(OwnTraining):
+    """Trains a code of each Gaussian and the codebook, and nothing of the scene."""
+
+    def __init__(self, scene: TrainedScene, options: UnifiedLiftRefiner) -> None:
+        self.scene, self.options = scene, options
+        self.ranks = ClassRanks(torch.tensor(list(scene.names), device=scene.surfels().means.device))
+        self.learned = LearnedCodes(scene, options.codes, bias=False)
+
+    def before_step(self, step: int) -> Edit | None:
+        self.learned.adam.zero_grad()
+        return None
+
+    def terms(self, inputs: LossInputs, step: int, base: Callable[[], Terms]) -> Terms:
+        if inputs.labels is None:
+            return {}
+        labels = self.ranks.ranked_labels(inputs.labels).flatten()
+        labelled = labels != IGNORE
+        if not bool(labelled.any()):  # a view without a mask
+            return {}
+        drawn = self.learned.drawn(inputs.surfels.detach(), inputs.camera).flatten(0, 1)
+        places = labelled.nonzero()[:, 0]
+        of_codes = self._terms_of_codes(drawn, labels, places, self.scene.generator(step, SAMPLES))
+        terms = {**of_codes, **self._terms_of_codebook(drawn.detach()[places], labels[places].long())}
+        return {name: object_codebook.WEIGHTS[name] * value for name, value in terms.items()}
+
+    def _terms_of_codes(self, drawn: Tensor, labels: Tensor, places: Tensor, generator: torch.Generator) -> Terms:
+        chosen = places[object_codebook.sampled(len(places), generator).to(places.device)]
+        # Determinism: the gradient of drawn[chosen] depends on the number of threads.
+        samples = torch.nn.functional.embedding(chosen, drawn)
+        return {
+            "contrast": object_codebook.contrast(samples, labels[chosen].long()),
+            "norms": object_codebook.norms(drawn, labels != IGNORE),
+        }
+
+    def _terms_of_codebook(self, drawn: Tensor, labels: Tensor) -> Terms:
+        """Return the terms of labelled pixels: drawn [P, C] without gradient, labels [P] ranks."""
+        codes, codebook = self.options.codes, self.learned.classifier
+        ids, group = torch.unique(labels, return_inverse=True)
+        masses, largest = object_codebook.code_masses(codebook, drawn, group, len(ids), codes)
+        targets = object_codebook.matching(masses)[group]
+        counted = object_codebook.reliable(drawn, group, len(ids)).nonzero()[:, 0]
+        if len(counted) == 0:
+            return {}
+        drawn, wanted = drawn[counted], targets[counted]
+        terms = {"concentration": object_codebook.concentration(codebook.weight, drawn, wanted)}
+        if bool((largest != targets).any()):
+            terms["classes"] = object_codebook.selection(codebook, drawn, wanted, codes)
+        return terms
+
+    def after_step(self, step: int) -> Edit | None:
+        self.learned.step()
+        return None
+
+    @torch.no_grad()
+    def finish(self) -> Membership:
+        scene, options, codebook, codes = self.scene, self.options, self.learned.classifier, self.learned.codes
+        tables = codes.new_zeros(len(self.ranks), options.codes, dtype=torch.int64)
+        for table in self._tables():
+            tables += table
+        owner = object_codebook.owners(tables)
+        owned, used = torch.unique(owner[owner >= 0]).tolist(), int((tables.sum(dim=0) > 0).sum())
+        seen = (tables.sum(dim=1) > 0).tolist()
+        lost = [scene.names[c] for rank, c in enumerate(self.ranks.ids.tolist()) if seen[rank] and rank not in owned]
+        without = f"; none is of {', '.join(lost)}: train longer (refine_steps)" if lost else ""
+        say(f"  codebook: {used} codes are used, {int((owner >= 0).sum())} of them are of one class{without}")
+        if options.rule == "argmax":
+            return Membership(self.ranks.class_ids(object_codebook.ranks_by_argmax(codebook, codes, owner)))
+        found = object_codebook.members_by_softmax(codebook, codes, owner, len(self.ranks), options.threshold)
+        means, ids = scene.surfels().means, self.ranks.ids.tolist()
+        if options.hull:
+            found = {rank: chosen | identity_codes.inside_hull(means, chosen) for rank, chosen in found.items()}
+        return Membership.of_masks({ids[rank]: chosen for rank, chosen in found.items()}, scene.class_ids())
+
+    def _tables(self) -> Iterator[Tensor]:
+        """Yield, per training view, how many labelled pixels of each class get each code, [K, codes] int64."""
+        scene, codes, surfels = self.scene, self.options.codes, self.scene.surfels().detach()
+        with scene.stage("Giving codes to classes") as progress:
+            for index, camera in enumerate(scene.cameras):
+                labels = self.ranks.ranked_labels(scene.labels[index]).flatten()
+                places = (labels != IGNORE).nonzero()[:, 0]
+                if len(places):
+                    drawn = self.learned.drawn(surfels, camera).flatten(0, 1)[places]
+                    largest = object_codebook.largest_codes(self.learned.classifier, drawn, codes)
+                    keys = labels[places].long() * codes + largest
+                    yield torch.bincount(keys, minlength=len(self.ranks) * codes).view(-1, codes)
+                progress(index + 1, len(scene.cameras))
+
+    def state(self) -> dict[str, Any]:
+        return self.learned.state()
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.learned.restore(state)
