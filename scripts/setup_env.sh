@@ -44,7 +44,7 @@ if [ ! -x "$env/bin/python" ]; then
   "$python" -m venv "$env"
 fi
 
-packages_now="$(printf '%s\n' constraints.txt pyproject.toml baselines/pyproject.toml | digest)"
+packages_now="$(printf '%s\n' constraints.txt pyproject.toml | digest)"
 source_now="$(pwd) $({
   printf '%s\n' pyproject.toml CMakeLists.txt
   printf '%s\n' cmake/cuda.cmake
@@ -89,7 +89,6 @@ if [ "$packages_now" != "$packages_before" ]; then
   # sam2 (transformers) is for the tests of its masks; it brings no weights.
   # The build tools are in the environment by now, so the build needs no isolated copy of them.
   pip install -qq --no-build-isolation "${build[@]}" "${pins[@]}" -e '.[dev,sam2]'
-  pip install -qq --no-build-isolation "${pins[@]}" -e ./baselines
   # nerfstudio brings plain opencv, which shares the folder cv2/ with contrib: the one written last wins.
   if ! contrib_works; then
     pip install -qq "${pins[@]}" --force-reinstall --no-deps "$opencv"
@@ -100,7 +99,6 @@ if [ "$packages_now" != "$packages_before" ]; then
 elif [ "$source_now" != "$source_before" ]; then
   rm -f "$env/.beags-source"
   pip install -qq --no-deps --no-build-isolation "${build[@]}" -e .
-  pip install -qq --no-deps --no-build-isolation -e ./baselines
   echo "$source_now" >"$env/.beags-source"
 fi
 if [ "$joined_now" != "$joined_before" ]; then
