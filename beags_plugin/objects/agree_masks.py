@@ -80,6 +80,8 @@ def agree_masks(config_path: Path, options: ReprojectionOptions, output: Path | 
             before_and_after(output / "doubt.png", pictured, LEGEND)
     written = ("masks", "report.json", *(["doubt.png"] if pictured else []))
     said = [f"{report.sentence(names)}.", *(str(output / name) for name in written)]
+    if options.run_size and _downscale(scene) != 1.0:
+        return [*said, "These masks are smaller than the photos: to train with masks, make them without --run-size."]
     return [*said, f"Next: {_refinement(scene, output.absolute())}"]
 
 

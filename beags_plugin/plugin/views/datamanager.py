@@ -78,7 +78,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         self._add_dense_seeds()
 
     def get_datapath(self) -> Path:
-        """Return the folder in which a viewer keeps camera paths: the run that ns-viewer opens, else that of the photos.
+        """Return where a viewer keeps camera paths: in the run that ns-viewer opens, else in the folder of the photos.
 
         The photos' folder may be somebody else's, or read-only.
         """
