@@ -14,7 +14,7 @@ import torch
 from beags_plugin.labels.classes import write_mask
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks.agreement import AgreedMask
-from beags_plugin.objects.picked_masks import option_words
+from beags_plugin.objects.picked_masks import refinement_command
 from beags_plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
 from beags_plugin.pictures.masks import Changed, before_and_after
 from beags_plugin.preparation.agreed import agree
@@ -22,7 +22,6 @@ from beags_plugin.preparation.pipeline import check_masks, known_classes
 from beags_plugin.runs.read import SavedScene
 from beags_plugin.runs.run import Run
 from beags_plugin.system.errors import writing
-from beags_plugin.system.pasted import command
 from beags_plugin.system.progress import counted, progress_bar
 from beags_plugin.views.data_options import DataOptions
 
@@ -94,10 +93,8 @@ def _downscale(scene: SavedScene) -> float:
 
 def _refinement(scene: SavedScene, output: Path) -> str:
     """Return the command that refines the run with the masks in ``output``."""
-    config = scene.config
     parser = replace(
-        cast(DataOptions, config.data_config.dataparser), downscale_factor=_downscale(scene),
-        masks_path=output / "masks", classes_path=output / "classes.json",
+        cast(DataOptions, scene.config.data_config.dataparser), data=scene.config.data_path,
+        downscale_factor=_downscale(scene), masks_path=output / "masks", classes_path=output / "classes.json",
     )  # fmt: skip
-    words = ["ns-train", config.method_name, "--data", config.data_path, "--load-dir", config.get_checkpoint_dir()]
-    return command([*words, *option_words(parser)])
+    return refinement_command(scene.config, parser)
