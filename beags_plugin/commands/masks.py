@@ -12,6 +12,7 @@ from rich.console import Console
 from beags_plugin.commands.starting import starting
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.output_option import OUTPUT
+from beags_plugin.system.pasted import command
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 
@@ -56,10 +57,19 @@ class Check:
             CONSOLE.print(line)
         for path in write_report(report, self.output or Path("outputs/masks_check") / report.data.name):
             CONSOLE.print(f"  {path}")
+        if self.load_config is not None and any(one.of == "pixels" for one in report.contradictions):
+            CONSOLE.print(f"Next: {self._agreement(report.data)}")
         if report.stops:
             if self.load_config is not None:
                 CONSOLE.print("The run is asked once no error is left.")
             sys.exit(1)
+
+    def _agreement(self, scene: Path) -> str:
+        """Return the command that makes these masks agree. scene: folder in which given paths of masks lie."""
+        options = {"--load-config": self.load_config, "--data": self.data}
+        for name, path in (("--masks-path", self.masks_path), ("--classes-path", self.classes_path)):
+            options[name] = None if path is None else scene.absolute() / path
+        return command(["beags", "masks", "agree", *(str(w) for pair in options.items() if pair[1] for w in pair)])
 
 
 @dataclass
@@ -124,7 +134,7 @@ class Agree:
     """Work at the size that was trained on instead of that of the photographs: quicker, smaller masks."""
     data: Path | None = None
     """Folder of the photos, if not where the run was trained on them."""
-    output: Path | None = None
+    output: Annotated[Path | None, OUTPUT] = None
     """Folder for masks, classes.json, report.json and doubt.png; agreed/ beside config.yml."""
 
     def run(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import cast
@@ -13,6 +14,7 @@ import torch
 from beags_plugin.labels.classes import write_mask
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks.agreement import AgreedMask
+from beags_plugin.objects.picked_masks import refinement_command
 from beags_plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
 from beags_plugin.pictures.masks import Changed, before_and_after
 from beags_plugin.preparation.agreed import agree
@@ -20,7 +22,6 @@ from beags_plugin.preparation.pipeline import check_masks, known_classes
 from beags_plugin.runs.read import SavedScene
 from beags_plugin.runs.run import Run
 from beags_plugin.system.errors import writing
-from beags_plugin.system.pasted import command, quoted
 from beags_plugin.system.progress import counted, progress_bar
 from beags_plugin.views.data_options import DataOptions
 
@@ -78,6 +79,8 @@ def agree_masks(config_path: Path, options: ReprojectionOptions, output: Path | 
             before_and_after(output / "doubt.png", pictured, LEGEND)
     written = ("masks", "report.json", *(["doubt.png"] if pictured else []))
     said = [f"{report.sentence(names)}.", *(str(output / name) for name in written)]
+    if options.run_size and _downscale(scene) != 1.0:
+        return [*said, "These masks are smaller than the photos: to train with masks, make them without --run-size."]
     return [*said, f"Next: {_refinement(scene, output.absolute())}"]
 
 
@@ -90,7 +93,8 @@ def _downscale(scene: SavedScene) -> float:
 
 def _refinement(scene: SavedScene, output: Path) -> str:
     """Return the command that refines the run with the masks in ``output``."""
-    config = scene.config
-    words = ["ns-train", config.method_name, "--data", config.data_path, "--load-dir", config.get_checkpoint_dir(),
-             "beags-data", "--downscale-factor", f"{_downscale(scene):g}"]  # fmt: skip
-    return f"{command(words)} --masks-path {quoted(output / 'masks')} --classes-path {quoted(output / 'classes.json')}"
+    parser = replace(
+        cast(DataOptions, scene.config.data_config.dataparser), data=scene.config.data_path,
+        downscale_factor=_downscale(scene), masks_path=output / "masks", classes_path=output / "classes.json",
+    )  # fmt: skip
+    return refinement_command(scene.config, parser)

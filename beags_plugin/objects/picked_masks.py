@@ -12,7 +12,9 @@ from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.masks.sources.cut import DrawnSource
 from beags_plugin.objects.check_masks import options_beside
 from beags_plugin.objects.make_masks import make_masks
+from beags_plugin.runs.layout import refinable
 from beags_plugin.runs.relocation import open_run
+from beags_plugin.runs.run_config import RunConfig
 from beags_plugin.system.digests import content_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.pasted import command
@@ -60,18 +62,25 @@ def save_masks(
     again = _holds_masks(folder)
     make_masks(data, DrawnSource(members, names), config_path, folder, overwrite=again)
     write_text_atomically(_digest(folder), folder / STAMP)
-    config = open_run(config_path)
     said = f"{'Replaced' if again else 'Saved'} {folder / 'masks'} and classes.json; look at {folder / 'made.png'}."
-    photos = config.data_config.photos
     own: dict[str, Any] = {"masks_path": None, "classes_path": Path("classes.json"), "ignore_ids": ()}
     if folder != scene:
         own |= {"masks_path": folder / "masks", "classes_path": folder / "classes.json"}
+    return SavedMasks(said, refinement_command(open_run(config_path), replace(data, **own)))
+
+
+def refinement_command(config: RunConfig, parser: DataOptions) -> str:
+    """Return the command that refines the scene of a run, or the base that a refined run began with, with other masks.
+
+    parser: the run's options of data, with the masks.
+    """
+    photos = config.data_config.photos
     words = [
-        "ns-train", "beags-refine", "--data", str(data.data), "--load-dir", str(config.get_checkpoint_dir().absolute()),
-        *([] if photos == "all" else ["--pipeline.datamanager.photos", photos]),
-        *option_words(replace(data, **own)),
+        "ns-train", "beags-refine", "--data", str(parser.data),
+        "--load-dir", str(refinable(config.get_checkpoint_dir().absolute())),
+        *([] if photos == "all" else ["--pipeline.datamanager.photos", photos]), *option_words(parser),
     ]  # fmt: skip
-    return SavedMasks(said, command(words))
+    return command(words)
 
 
 def option_words(parser: DataOptions) -> list[str]:

@@ -26,6 +26,15 @@ def newest_checkpoint(folder: Path) -> Path:
     return checkpoints[-1]
 
 
+def refinable(models: Path) -> Path:
+    """Return the nerfstudio_models folder that refinement begins at: that of a run's base, if the run keeps one.
+
+    models: the run's own; a refined scene is not refined again.
+    """
+    base = models.parent / BASE_SNAPSHOT / models.name
+    return base if any(base.glob("step-*.ckpt")) else models
+
+
 def preparing_run(run: Path) -> Path:
     """Return the run that prepared ``run``: itself, or the one that it is the base or an extract of."""
     origin = run / EXTRACTION_FILE

@@ -109,7 +109,12 @@ def refused(error: OSError) -> UserError | None:
 
 
 def silence_libraries() -> None:
-    """Drop warnings that are meant for the authors of torch and nerfstudio, in programs that run beags alone."""
+    """Drop warnings that are meant for the authors of torch and nerfstudio, in programs that run beags alone.
+
+    Warnings of other code are shown as before; so are all of them where ``python -W`` or PYTHONWARNINGS asks for some.
+    """
+    if sys.warnoptions:
+        return
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|nerfstudio)\.")
     warnings.filterwarnings("ignore", category=UserWarning, module=r"nerfstudio\.")
 

@@ -11,6 +11,7 @@ from typing import Protocol
 from beags_plugin.runs.layout import newest_checkpoint
 from beags_plugin.runs.relocation import Placed, check_data, relocate
 from beags_plugin.system.errors import print_user_errors_plainly
+from beags_plugin.system.program import path_option, program_name
 
 _named: list[Path] = []  # config.yml files that Python code has said it reads
 
@@ -41,24 +42,14 @@ def named(config_path: Path) -> Iterator[None]:
 
 def place_for_nerfstudio(config: OpenedConfig) -> None:
     """Place a config that an ns-* command reads from YAML where its --load-config says that the run lies."""
-    path = _named[-1] if _named else _option("--load-config")
+    path = _named[-1] if _named else path_option("--load-config")
     if path is None:
         return
-    if Path(sys.argv[0]).stem == "ns-train" and not _named:
-        relocate(config, path, _option("--data"))
-        config.overwrite = "--overwrite" in sys.argv and _option("--overwrite") != Path("False")
+    if program_name() == "ns-train" and not _named:
+        relocate(config, path, path_option("--data"))
+        config.overwrite = "--overwrite" in sys.argv and path_option("--overwrite") != Path("False")
         return
     print_user_errors_plainly()
     relocate(config, path, None)
     newest_checkpoint(config.get_checkpoint_dir())
     check_data(config.data_path, path)
-
-
-def _option(name: str) -> Path | None:
-    """Return the path that this program's command line gives an option, spelt with - or _; None where it does not."""
-    words = sys.argv[1:]
-    for index, word in enumerate(words):
-        option, equals, value = word.partition("=")
-        if option.replace("_", "-") == name and (equals or index + 1 < len(words)):
-            return Path(value if equals else words[index + 1])
-    return None

@@ -43,6 +43,7 @@ def viewed_pipeline(config_path: Path, data: Path | None = None) -> tuple[BeagsT
     pipeline = config.pipeline.setup(device=torch.device(default_device()), test_mode="test")
     pipeline.eval()
     pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])
+    pipeline.datamanager.get_datapath = config.get_base_dir  # camera paths go there
     return config, pipeline, checkpoint["step"]
 
 

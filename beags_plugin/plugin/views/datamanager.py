@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -24,6 +25,7 @@ from beags_plugin.labels.label_maps import CompressedMap, to_compact, to_int32
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.program import path_option, program_name
 from beags_plugin.system.progress import say
 from beags_plugin.views.cameras import camera_from_nerfstudio, take_intrinsics
 from beags_plugin.views.close_ups import CloseUps
@@ -74,6 +76,14 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         # nerfstudio samples evaluation views by Python's global generator, which others use too.
         self._eval_order = random.Random(config.train_cameras_sampling_seed)
         self._add_dense_seeds()
+
+    def get_datapath(self) -> Path:
+        """Return where a viewer keeps camera paths: in the run that ns-viewer opens, else in the folder of the photos.
+
+        The photos' folder may be somebody else's, or read-only.
+        """
+        config_path = path_option("--load-config") if program_name() == "ns-viewer" else None
+        return super().get_datapath() if config_path is None else config_path.absolute().parent
 
     def focus(self) -> None:
         """Have training see close-ups of objects from here on, where the option ``focus`` says so."""

@@ -20,6 +20,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
+from beags_plugin.plugin.views.ns_programs import prepare_reading
 from beags_plugin.plugin.views.ns_train import prepare
 from beags_plugin.system.errors import print_user_errors_plainly
 from beags_plugin.views.cameras import SceneCameras
@@ -80,6 +81,7 @@ def __getattr__(name: str) -> DataParserSpecification:
     if name != "beags_data":
         raise AttributeError(name)
     prepare()
+    prepare_reading()
     return DataParserSpecification(
         config=BeagsDataParserConfig(),
         description="Scenes with class id images: nerfstudio, COLMAP, LLFF and other layouts (BEA-GS).",

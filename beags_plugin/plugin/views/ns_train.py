@@ -6,10 +6,10 @@ nerfstudio loads data parsers of other packages first, long before their methods
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import Any
 
 from beags_plugin.system.errors import UserError, check_choice, meant, silence_libraries
+from beags_plugin.system.program import program_name
 from beags_plugin.system.shipped import shipped_names
 
 
@@ -18,10 +18,10 @@ def prepare() -> None:
 
     Other programs, and ns-train with other methods, are left as they are.
     """
-    program, *words = sys.argv
+    words = sys.argv[1:]
     name = words[0] if words else ""
     presets = shipped_names("method_configs")
-    if Path(program).stem != "ns-train" or not (name.startswith("beags") or meant(name, presets)):
+    if program_name() != "ns-train" or not (name.startswith("beags") or meant(name, presets)):
         return
     try:
         check_choice(name, presets, "preset")

@@ -1,0 +1,58 @@
+"""What nerfstudio's programs do with a run of ours before they have imported nerfstudio's own methods.
+
+One warning comes before any code of ours: ``torch.jit.script`` in nerfstudio's cameras, which our data parser needs.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+from beags_plugin.system.errors import silence_libraries
+from beags_plugin.system.pasted import command
+from beags_plugin.system.program import path_option, program_name
+
+PROGRAMS = ("ns-viewer", "ns-render", "ns-eval", "ns-export")
+_OF_OURS = b"!!python/object:beags_plugin."
+_VIDEOS = ("camera-path", "interpolate", "spiral")  # modes of ns-render that ask for ffmpeg, for images too
+
+
+def prepare_reading() -> None:
+    """Make a program that opens a run of ours quieter; end ns-render with one sentence where it would fail later.
+
+    Other programs, and runs of other methods, are left as they are.
+    """
+    path, program = path_option("--load-config"), program_name()
+    if program not in PROGRAMS or path is None or not _is_ours(path):
+        return
+    silence_libraries()
+    if program == "ns-render" and (sentence := _cannot_render(sys.argv[1], path)) is not None:
+        print(f"beags: {sentence}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _is_ours(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(len(_OF_OURS)) == _OF_OURS
+    except OSError:  # nerfstudio says so
+        return False
+
+
+def _cannot_render(mode: str, config_path: Path) -> str | None:
+    """Return why a mode of ns-render fails, and the command that does not; None if it works."""
+    words = ["beags", "render", "--load-config", str(config_path)]
+    if mode == "spiral":  # it asks for rays of single pixels, as splatfacto has none either
+        return (
+            "ns-render spiral takes no method that trains on whole photos: take ns-render interpolate, or swing before "
+            f"the objects with {command([*words, '--turn', '60'])}"
+        )
+    if mode not in _VIDEOS or shutil.which("ffmpeg") is not None:
+        return None
+    if mode == "camera-path":
+        words += ["--camera-path", str(path_option("--camera-path-filename") or "camera_path.json")]
+    if (output := path_option("--output-path")) is not None:
+        words += ["--output", str(output)]
+    shown = "" if mode == "camera-path" else ", which turns about the objects"
+    return f"ns-render {mode} needs ffmpeg, which is not installed; this needs none{shown}: {command(words)}"

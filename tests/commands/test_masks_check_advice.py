@@ -1,0 +1,24 @@
+"""What ``beags masks check`` tells people to do next can be pasted."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import tyro
+
+from beags_plugin.commands.masks import Agree, Check
+
+
+def test_the_command_that_makes_masks_agree_names_the_same_run_data_and_masks(tmp_path):
+    check = Check(load_config=Path("my run/config.yml"), data=Path("/my data"), masks_path=Path("my masks"))
+    words = shlex.split(check._agreement(tmp_path))
+    assert words[:3] == ["beags", "masks", "agree"]
+    agree = tyro.cli(Agree, args=words[3:])
+    assert (agree.load_config, agree.data) == (check.load_config, check.data)
+    assert agree.masks_path == tmp_path / "my masks" and agree.classes_path is None
+
+
+def test_masks_agree_takes_output_dir_too():
+    agree = tyro.cli(Agree, args=["--load-config", "run", "--output-dir", "there"])
+    assert agree.output == Path("there")
