@@ -87,9 +87,10 @@ def words_of(line: str) -> list[str]:
 def folder(tmp_path_factory):
     """Return a folder with two runs of the data my_scene, and a scene to start from."""
     root = tmp_path_factory.mktemp("reader")
-    write_camera_path(write_scene(root / "my_scene") / "camera_paths/flight.json")
+    write_scene(root / "my_scene")
     for name in ("run", "other"):
         config = write_trained(root / name, root / "my_scene")
+    write_camera_path(root / "run/camera_paths/flight.json")
     from beags_plugin.objects.extract import extract_objects
     from beags_plugin.runs.run import Run
 
@@ -159,7 +160,7 @@ def test_commands_in_the_text_exist():
     """Every `beags NAME` in the text is a subcommand."""
     known = {command.__name__.lower() for command in typing.get_args(cli.Command)} | {*more.COMMANDS.names()}
     for document in DOCUMENTS:
-        named = set(re.findall(r"`beags ([a-z-]+)", document.read_text("utf8")))
+        named = set(re.findall(r"`beags ([a-z][a-z-]+)", document.read_text("utf8")))
         assert named <= known, f"{document.name}: {named - known}"
 
 

@@ -1,7 +1,7 @@
 """Classes of Gaussians that overlap and leave gaps."""
 
 import torch
-from support.random_surfels import random_surfels
+from random_surfels import random_surfels
 
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.select import remove_class, select_class

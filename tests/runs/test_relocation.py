@@ -105,7 +105,7 @@ def test_commands_of_nerfstudio_read_and_write_where_the_run_lies(moved, tmp_pat
     monkeypatch.setattr("sys.argv", ["ns-viewer", "--load-config", str(moved / "config.yml")])
     config, pipeline, checkpoint, _ = eval_setup(moved / "config.yml")  # all that ns-viewer takes from it
     assert config.get_base_dir() == moved and checkpoint.parent.parent == moved
-    assert pipeline.datamanager.get_datapath() == tmp_path / "new/lab"
+    assert pipeline.datamanager.get_datapath() == moved  # camera paths go there
     assert f"trained in {tmp_path}/old/outputs/run" in capsys.readouterr().out
     ComputePSNR(moved / "config.yml", tmp_path / "psnr.json").main()
     assert json.loads((tmp_path / "psnr.json").read_text())["checkpoint"] == str(checkpoint)
