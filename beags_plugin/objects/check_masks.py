@@ -161,14 +161,6 @@ def check_scene(config: DataOptions, few_views: int = FEW_VIEWS) -> Report:
     return report
 
 
-def agreement_of(config: DataOptions) -> tuple[np.ndarray, int]:
-    """Return labels [P, V] of points in space in every view (``consistency.Agreement``) and the number of classes."""
-    scene, views, files = _files(config)
-    coverage = check_files(files)
-    points = points_in_space(scene, views, config)
-    return agreements(files, coverage, views, points, [])[0].labels, len(coverage.ids)
-
-
 def _files(config: DataOptions) -> tuple[Dataset, PosedViews, MaskFiles]:
     parser = SceneData(config)
     scene, views = parser.posed_views()
