@@ -27,7 +27,6 @@ MOST_ROWS = 8
 
 Figure = tuple[str, int, float]
 """Its name in a row, digits, factor."""
-IOU: Figure = ("extracted_iou_after", 1, 100.0)
 BIOU: Figure = ("extracted_biou_after", 1, 100.0)
 SPILL: Figure = ("extracted_spill_after", 1, 100.0)
 RENDERED: Figure = ("rendered_biou_after", 1, 100.0)
@@ -36,20 +35,23 @@ SECONDS: Figure = ("cpu_seconds", 0, 1.0)
 ALL_SECONDS: Figure = ("cpu_seconds total", 0, 1.0)
 BEAR, DIGGER = "bear, salient", "kitchen, salient"
 
+Column = tuple[str, str, Figure]
+"""File of docs/results, without ".json"; the scene there; the figure of that scene."""
+
 
 @dataclass(frozen=True)
 class PageTable:
-    """A table of one page: a line for each row of a result, a column for each of its scenes.
+    """A table of one page: a line for each row of a result, a column for each figure of a scene.
 
-    page: path below the root. name: in its marks. columns: by what they are called, the file of docs/results, without
-    ".json", and the scene there. rows: names of the results' rows. figures: what each cell holds, in order.
+    page: path below the root. name: in its marks. corner: the first cell, which names the scene of all columns, or
+    nothing. columns: by their headings, one figure a cell. rows: names of the results' rows.
     """
 
     page: str
     name: str
-    columns: Mapping[str, tuple[str, str]]
+    corner: str
+    columns: Mapping[str, Column]
     rows: Sequence[str]
-    figures: Sequence[Figure]
 
     @property
     def begin(self) -> str:
@@ -57,51 +59,82 @@ class PageTable:
         return f"<!-- table {self.name}, made by python -m beags_benchmarks.studies.page_tables -->\n"
 
 
+def _of_scene(file: str, scene: str, figures: Mapping[str, Figure]) -> dict[str, Column]:
+    return {heading: (file, scene, figure) for heading, figure in figures.items()}
+
+
 CAPTURES = {"bear, 400 pixels": ("captures-bear", BEAR), "digger, 480 pixels": ("captures-kitchen", DIGGER)}
-"""README's columns."""
+"""File and scene of the captures that README shows, by the names they have there and in its curve."""
+_ALL = {
+    "BIoU, %": BIOU,
+    "spill, %": SPILL,
+    "BIoU in the scene, %": RENDERED,
+    "PSNR, dB": FITTED,
+    "CPU seconds": SECONDS,
+}
+_COSTS = {"BIoU, %": BIOU, "spill, %": SPILL, "PSNR, dB": FITTED, "CPU seconds": SECONDS}
+_OF_BASES = {"BIoU, %": BIOU, "BIoU in the scene, %": RENDERED, "PSNR, dB": FITTED, "CPU seconds in all": ALL_SECONDS}
+_REFINED = (
+    "assignment alone",
+    "as long as beags-fast, neither loss",
+    "beags-fast",
+    "as long as beags-refine, neither loss",
+    "beags-refine",
+    "the paper's losses",
+)
+_COMPARED = (
+    "assignment alone",
+    "flashsplat",
+    "gaussiancut",
+    "trace3d",
+    "objectgs",
+    "cob-gs, one scene",
+    "the paper's losses, same masks",
+    "beags-fast, same masks",
+)
 TABLES: tuple[PageTable, ...] = (
     PageTable(
         "README.md",
         "captures",
-        CAPTURES,
-        ("assignment alone", "the paper's losses", "beags-fast", "beags-refine"),
-        (BIOU, SPILL, FITTED, SECONDS),
-    ),
-    PageTable(
-        "docs/results.md",
-        "captures-all",
-        CAPTURES,
-        (
-            "assignment alone",
-            "as long as beags-fast, neither loss",
-            "beags-fast",
-            "as long as beags-refine, neither loss",
-            "beags-refine",
-            "the paper's losses",
-        ),
-        (IOU, BIOU, SPILL, RENDERED, FITTED, SECONDS),
-    ),
-    PageTable(
-        "docs/results.md",
-        "captures-more",
+        "",
         {
-            "vase and table, 400 pixels": ("captures-garden", "garden, picked"),
-            "apple and banana, 400 pixels": ("captures-fruit", "fruit, given"),
+            "bear: BIoU, %": ("captures-bear", BEAR, BIOU),
+            "bear: seconds": ("captures-bear", BEAR, SECONDS),
+            "digger: BIoU, %": ("captures-kitchen", DIGGER, BIOU),
+            "digger: seconds": ("captures-kitchen", DIGGER, SECONDS),
         },
-        ("assignment alone", "as long as beags-fast, neither loss", "beags-fast"),
-        (IOU, BIOU, SPILL, RENDERED, FITTED, SECONDS),
+        ("assignment alone", "the paper's losses", "beags-fast", "beags-refine"),
+    ),
+    *(
+        PageTable("docs/results.md", file, name, _of_scene(file, scene, _ALL), _REFINED)
+        for name, (file, scene) in CAPTURES.items()
+    ),
+    PageTable(
+        "docs/results.md",
+        "captures-garden",
+        "vase and table, 400 pixels",
+        _of_scene("captures-garden", "garden, picked", _ALL),
+        (*_REFINED[:3], "the paper's losses"),
+    ),
+    PageTable(
+        "docs/results.md",
+        "captures-fruit",
+        "apple and banana, 400 pixels",
+        _of_scene("captures-fruit", "fruit, given", _ALL),
+        _REFINED[:3],
     ),
     PageTable(
         "docs/results.md",
         "trade-off",
-        {"digger, 260 pixels": ("trade-off-kitchen", DIGGER)},
+        "digger, 260 pixels",
+        _of_scene("trade-off-kitchen", DIGGER, _COSTS),
         ("200 steps (beags-fast)", "50 steps", "800 steps", "k / 8", "k x 8", "Z = 5", "Z = 100", "no reprojection"),
-        (BIOU, SPILL, FITTED, SECONDS),
     ),
     PageTable(
         "docs/results.md",
         "bases",
-        {"digger, 260 pixels": ("trade-off-kitchen", DIGGER)},
+        "digger, 260 pixels",
+        _of_scene("trade-off-kitchen", DIGGER, _OF_BASES),
         (
             "200 steps (beags-fast)",
             "base: no wider limits far away",
@@ -110,23 +143,20 @@ TABLES: tuple[PageTable, ...] = (
             "base: no normal consistency",
             "base: with distortion",
         ),
-        (BIOU, RENDERED, FITTED, ALL_SECONDS),
     ),
     PageTable(
         "docs/comparison.md",
-        "comparison",
-        {"bear, 260 pixels": ("comparison-bear", BEAR), "digger, 260 pixels": ("comparison-kitchen", DIGGER)},
-        (
-            "assignment alone",
-            "flashsplat",
-            "gaussiancut",
-            "trace3d",
-            "objectgs",
-            "cob-gs, one scene",
-            "the paper's losses, same masks",
-            "beags-fast, same masks",
-        ),
-        (BIOU, SPILL, RENDERED, FITTED, SECONDS),
+        "comparison-bear",
+        "bear, 260 pixels",
+        _of_scene("comparison-bear", BEAR, _ALL),
+        _COMPARED,
+    ),
+    PageTable(
+        "docs/comparison.md",
+        "comparison-kitchen",
+        "digger, 260 pixels",
+        _of_scene("comparison-kitchen", DIGGER, _ALL),
+        _COMPARED,
     ),
 )
 _SOURCE = ("experiment", "preset", "reference", "command", "commit", "machine", "torch", "busy", "quick", "protocol")
@@ -187,13 +217,12 @@ def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 def lines_of(table: PageTable, folder: Path) -> str:
     """Return a table in Markdown, from the files of ``folder``; raises ``UserError`` for what lacks."""
-    lines = [["", *table.columns], ["---"] * (1 + len(table.columns))]
+    lines = [[table.corner, *table.columns], ["---"] * (1 + len(table.columns))]
     for name in table.rows:
         cells = []
-        for file, scene in table.columns.values():
+        for file, scene, (figure, digits, factor) in table.columns.values():
             row = _row_of(folder / f"{file}.json", name, scene)
-            shown = (number(row.get(figure), digits, factor) for figure, digits, factor in table.figures)
-            cells.append("failed" if row.get("failed") else ", ".join(shown))
+            cells.append("failed" if row.get("failed") else number(row.get(figure), digits, factor))
         lines.append([f"`{name}`" if name.startswith("beags") and " " not in name else name, *cells])
     return "".join(f"| {' | '.join(line)} |\n".replace("|  |", "| |") for line in lines)
 
