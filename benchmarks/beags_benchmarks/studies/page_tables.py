@@ -1,4 +1,4 @@
-"""Tables of README and the pages: ``python -m beags_benchmarks.studies.page_tables [captures.json ...]``.
+"""Tables of README, pages and notes: ``python -m beags_benchmarks.studies.page_tables [captures.json ...]``.
 
 Each given result of ``beags bench`` is reduced to its means, the extracted BIoU of each object, protocol, command,
 commit and machine in docs/results. Then every table of ``TABLES`` is written anew between its two marks, from the files
@@ -124,14 +124,14 @@ TABLES: tuple[PageTable, ...] = (
         _REFINED[:3],
     ),
     PageTable(
-        "docs/results.md",
+        "notes/refinement-on-captures.md",
         "trade-off",
         "digger, 260 pixels",
         _of_scene("trade-off-kitchen", DIGGER, _COSTS),
         ("200 steps (beags-fast)", "50 steps", "800 steps", "k / 8", "k x 8", "Z = 5", "Z = 100", "no reprojection"),
     ),
     PageTable(
-        "docs/results.md",
+        "notes/refinement-on-captures.md",
         "bases",
         "digger, 260 pixels",
         _of_scene("trade-off-kitchen", DIGGER, _OF_BASES),
