@@ -151,8 +151,8 @@ def test_what_an_interruption_left_is_not_trained_again(miniature):
 
 
 def test_the_file_in_the_documentation_is_an_experiment(tmp_path):
-    text = (ROOT / "docs/experiments.md").read_text()
-    block = text.split("## The file")[1].split("Keys are")[0]
+    text = (ROOT / "benchmarks/README.md").read_text()
+    block = text.split("## The file of an experiment")[1].split("Keys are")[0]
     path = written(tmp_path, "\n".join(line.strip() for line in block.splitlines()))
     found = load_experiment(path)
     assert [variant.name for variant in found.variants][:2] == ["as it is", "worse masks"]

@@ -15,7 +15,7 @@ class PaperOptions(EngineOptions):
     """Which of the paper's methods to run on which of its data sets, and how."""
 
     data_root: Path
-    """Folder that holds the data sets' folders: mip360, llff, lerf, 3dovs (docs/evaluation.md)."""
+    """Folder that holds the data sets' folders: mip360, llff, lerf, 3dovs (benchmarks/README.md)."""
     data_set: tuple[str, ...] = ()
     """Which data sets: mip360, llff, lerf, 3dovs; all if left out."""
     methods: tuple[str, ...] = ()
