@@ -1,6 +1,7 @@
 """BEA-GS: clean object extraction from Gaussian-splat scenes, as a nerfstudio plugin.
 
-Importing this package imports nothing heavy: every ns-* command pays for it at start-up.
+Importing it loads no torch and no nerfstudio, because every ns-* command imports it at its start. docs/architecture.md
+says which folder holds what.
 """
 
 __version__ = "0.2.0"

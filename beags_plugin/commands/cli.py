@@ -1,4 +1,4 @@
-"""The command line ``beags``: its commands, and what becomes of errors."""
+"""The command line ``beags``: one dataclass for each command, whose docstrings are the help, and how errors end."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ CONSOLE = Console(soft_wrap=True, highlight=False)
 
 @dataclass
 class Demo:
-    """Train, extract and measure: on the sample that ships with the code, or on a scene, photos or a video of yours.
+    """Train, extract and measure: on a generated sample, or on a scene, photos or a video of yours.
 
-    Poses are computed where there are none, and masks made of what stands out.
+    Where there are no poses they are computed; where there are no masks, a small network marks what stands out.
     """
 
     data: Path | None = None
@@ -44,7 +44,7 @@ class Demo:
     output: Annotated[Path | None, OUTPUT] = None
     """Where everything goes; outputs/demo, or outputs/<name of the data>."""
     preset: str | None = None
-    """What to train with: a preset of method_configs/; beags-tiny for the sample, beags-fast for data, if left out."""
+    """What to train with: a preset of method_configs/; if left out, beags-tiny for the sample, beags-fast for data."""
     downscale: float | None = None
     """Divide the image size by this; chosen for a quick run if left out (a folder of your own only)."""
     seed: int = 0
@@ -76,7 +76,7 @@ class Resume:
     """Folder of the run (or its config.yml)."""
 
     device: Literal["cpu", "cuda"] | None = None
-    """Continue here instead of where it was begun; the result is then no longer the same in every bit."""
+    """Continue on this device instead of where it was begun; the result is then not the same in every bit."""
 
     data: Path | None = None
     """Folder of the photos, if not where the run was trained on them."""
@@ -148,9 +148,9 @@ class Extract:
     json: Path | None = None
     """File that lists what was written."""
     keep_all: bool = False
-    """Keep Gaussians too that do not belong: spikes outside the object's masks, loose parts that no mask supports."""
+    """Also keep Gaussians that do not belong: spikes outside the object's masks, loose parts that no mask supports."""
     data: Path | None = None
-    """Folder of the photos, whose cameras tell what belongs, if not where the run was trained on them."""
+    """Folder of the photos, if not where the run was trained on them; its cameras tell what belongs."""
 
     def run(self) -> None:
         with starting(self):
@@ -195,10 +195,9 @@ class Export:
     json: Path | None = None
     """File that lists what was written."""
     data: Path | None = None
-    """Folder of the photos, whose cameras tell what belongs, and which meshes need, if not where the run was trained
-    on them."""
+    """Folder of the photos, if not where the run was trained on them. Meshes need it; its cameras tell what belongs."""
     keep_all: bool = False
-    """Keep Gaussians too that do not belong: spikes outside an object's masks, loose parts that no mask supports."""
+    """Also keep Gaussians that do not belong: spikes outside an object's masks, loose parts that no mask supports."""
     close: bool = False
     """Close objects where no photo shows them, such as underneath, with Gaussians or triangles that a .ply and a .glb
     mark as invented; .stl and .3mf are always closed."""
@@ -270,7 +269,7 @@ class Render:
     """video (.mp4 or .gif), sheet (.png or .jpg), or before-after (any of these, by the name of the file)."""
     underlay: bool = False
     """Write <object>/<photo>.png: each object alone over the faded photo, in every held-out view, as large as the
-    photo. Draw its silhouette over it, white on black, and beags eval reads it (docs/evaluation.md)."""
+    photo. A silhouette drawn over it, white on black, is read by beags eval (docs/evaluation.md)."""
     output: Annotated[Path | None, OUTPUT] = None
     """The file (with --underlay the folder); in renders/ beside config.yml if left out."""
     data: Path | None = None
@@ -347,7 +346,7 @@ class Doctor:
     """Folder of a scene (or a transforms .json)."""
 
     json: Path | None = None
-    """File for the same."""
+    """File for the report."""
 
     def run(self) -> None:
         from beags_plugin.commands.doctor.check import print_check
@@ -362,12 +361,12 @@ class Doctor:
 
 
 def counted_gaussians(count: int, left_out: object) -> str:
-    """Return a phrase on an object's Gaussians; left_out: those that do not belong, None where none was looked for."""
+    """Return a phrase on an object's Gaussians. left_out: those dropped, or None if nothing was looked for."""
     return f"{count} Gaussians" if left_out is None else f"{count} Gaussians; {left_out}"
 
 
 def write_json(path: Path | None, content: object) -> None:
-    """Write plain values, and paths as text, unless ``path`` is None; raises ``UserError`` if that fails."""
+    """Write ``content`` as JSON, paths as text, unless ``path`` is None; raises ``UserError`` if that fails."""
     if path is not None:
         write_text_atomically(json.dumps(content, indent=2, default=str) + "\n", path)
 
@@ -376,14 +375,14 @@ Command = Demo | Process | Resume | Sample | Masks | View | Extract | Export | C
 
 
 def all_commands(arguments: list[str] | None) -> Any:
-    """Return the union of our commands, and of other packages' unless the arguments name one of ours."""
+    """Return the union of our commands and, unless the arguments name one of ours, of other packages' commands."""
     ours = [command.__name__.lower() for command in get_args(Command)]
     first = next(iter(sys.argv[1:] if arguments is None else arguments), "")
     return Command if first in ours else Union[(Command, *more_commands(first, ours))]  # noqa: UP007  (of a tuple)
 
 
 def exit_with(error: UserError) -> NoReturn:
-    """Print a user error, unless the trainer has, and end with exit code 2."""
+    """Print a user error, unless the trainer has printed it, and end with exit code 2."""
     if not error.reported:
         CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}")
     sys.exit(2)

@@ -14,8 +14,9 @@ EXTENT_MARGIN = 1.1  # the scene's extent is 1.1 x the largest distance of a cam
 class Camera:
     """One pinhole view.
 
-    viewmat: [4, 4] float, world to camera; x right, y down, z forward (OpenCV); rigid.
-    K: [3, 3] float, pixels; any cx, cy. Pixel (i, j) has its centre at (i + 0.5, j + 0.5).
+    viewmat: [4, 4] float, rigid transform from world to camera; x right, y down, z forward (OpenCV).
+    K: [3, 3] float, intrinsics in pixels, with any cx, cy. Pixel (i, j), column and row, has its centre at
+        (i + 0.5, j + 0.5).
     width, height: pixels.
     """
 
@@ -36,7 +37,7 @@ class Camera:
 
     @property
     def focal(self) -> float:
-        """Return the geometric mean of both axes' focal lengths, pixels: at depth z a pixel covers (z / focal)^2."""
+        """Return the geometric mean of both focal lengths, pixels; a pixel at depth z covers (z / focal)^2 of area."""
         K = self.host.K
         return (float(K[0, 0]) * float(K[1, 1])) ** 0.5
 
@@ -45,20 +46,20 @@ class Camera:
         """Return the camera's position in the world, [3]."""
         if self.viewmat.requires_grad or not self.viewmat.is_cpu:
             return -self.rotation.T @ self.translation
-        # in Python's numbers: half the time of seven operations of torch
+        # Python's numbers take half the time of seven operations of torch.
         rows = self.viewmat.tolist()
         return self.viewmat.new_tensor([-sum(rows[k][axis] * rows[k][3] for k in range(3)) for axis in range(3)])
 
     @property
     def host(self) -> Camera:
-        """Return the same camera on the CPU, if this one was made from it by ``to``, else itself.
+        """Return the camera on the CPU that ``to`` made this one from, else this one.
 
-        Its numbers can be read without waiting for a GPU. Cameras are not changed in place.
+        Its numbers can be read without waiting for a GPU. Cameras are never changed in place.
         """
         return self.__dict__.get("_host", self)
 
     def to(self, *args) -> Camera:
-        """Move both matrices as ``Tensor.to`` does."""
+        """Return the camera with both matrices moved or cast as ``Tensor.to`` does."""
         moved = Camera(self.viewmat.to(*args), self.K.to(*args), self.width, self.height)
         if not moved.viewmat.is_cpu and self.host.viewmat.is_cpu:
             moved.__dict__["_host"] = self.host
@@ -66,9 +67,9 @@ class Camera:
 
 
 def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
-    """Return the camera of a region of its image: the same, with the principal point shifted.
+    """Return the camera that sees a region of this camera's image: its principal point is shifted.
 
-    left, top: of the region, pixels. width, height: of the region.
+    left, top: the region's first column and row, pixels. width, height: its size, pixels.
     """
     host = camera.host
     shift = host.K.new_tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
@@ -76,12 +77,12 @@ def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Cam
 
 
 def viewmat_from_opengl(camera_to_world: Tensor) -> Tensor:
-    """Return the world-to-camera matrix, OpenCV axes, of a camera-to-world matrix, OpenGL axes (nerfstudio's).
+    """Convert nerfstudio's camera-to-world matrices (OpenGL axes) to world-to-camera matrices (OpenCV axes).
 
-    This is the one place where the two conventions meet.
+    This is the only place where the two conventions meet.
 
-    camera_to_world: [..., 3 or 4, 4]; x right, y up, z backward.
-    Returns [..., 4, 4] of the same dtype.
+    camera_to_world: [..., 3 or 4, 4] float; x right, y up, z backward. Returns [..., 4, 4] of the same dtype; x right,
+    y down, z forward.
     """
     rotation = camera_to_world[..., :3, :3] * camera_to_world.new_tensor([1.0, -1.0, -1.0])
     world_to_camera = rotation.transpose(-1, -2)
@@ -93,7 +94,10 @@ def viewmat_from_opengl(camera_to_world: Tensor) -> Tensor:
 
 
 def camera_extent(camera_to_worlds: Tensor) -> Tensor:
-    """Return the scene's size: 1.1 x the largest distance of a camera [V, 3, 4] from their mean; 1 for a single one."""
+    """Return the scene's extent, [] float32, world units: 1.1 x the largest distance of a camera from their mean.
+
+    camera_to_worlds: [V, 3, 4] float. One camera alone has the extent 1.
+    """
     centers = camera_to_worlds[..., :3, 3].float()
     extent = EXTENT_MARGIN * (centers - centers.mean(dim=0)).norm(dim=-1).max()
     return extent if float(extent) > 0 else torch.ones(())

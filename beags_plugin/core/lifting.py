@@ -1,4 +1,4 @@
-"""Between pixels with a depth and points in the world (method, sections 0 and 2)."""
+"""Convert pixels with a depth to points in the world, and back (method, sections 0 and 2)."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from beags_plugin.core.cameras import Camera
 
 MARGIN = 1.3
 TAU = 0.02
-"""Depths that differ by less than this share are of one surface; what is nearer by more hides (method, E5)."""
+"""Depths that differ by at most this share lie on one surface; something nearer by more hides it (method, E5)."""
 
 
 def pixel_rays(camera: Camera, like: Tensor) -> Tensor:
     """Return camera-space points at depth 1 under the pixel centres: K^-1 (i + 0.5, j + 0.5, 1).
 
-    like: any tensor; gives dtype and device. Returns [H, W, 3]; the last component is 1.
+    like: any tensor, whose dtype and device the result has. Returns [H, W, 3]; the last component is 1.
     """
     K = camera.K.to(like)
     x = torch.arange(camera.width, dtype=like.dtype, device=like.device) + 0.5
@@ -26,10 +26,10 @@ def pixel_rays(camera: Camera, like: Tensor) -> Tensor:
 
 
 def lift(depth: Tensor, camera: Camera) -> Tensor:
-    """Return the world points of all pixels of a view.
+    """Return the world point of every pixel of a view.
 
-    depth: [H, W] float, world units along z (not along the ray). Returns [H, W, 3] of the same dtype;
-    a pixel without depth (0) gives the camera's position.
+    depth: [H, W] float, world units along z (not along the ray). Returns [H, W, 3] of the same dtype; a pixel without
+    depth (0) gives the camera's position. Raises ``ValueError`` if the depth has another size than the camera.
     """
     if tuple(depth.shape) != (camera.height, camera.width):
         raise ValueError(f"depth must be [{camera.height}, {camera.width}], not {list(depth.shape)}")
@@ -40,8 +40,8 @@ def lift(depth: Tensor, camera: Camera) -> Tensor:
 def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Return pixel coordinates and depths of world points.
 
-    points: [P, 3] float. Returns (xy [P, 2] pixels, z [P] world units along z) of the same dtype. Only where z > 0
-    does xy mean anything (at z = 0 it is not finite).
+    points: [P, 3] float. Returns xy [P, 2] in pixels and z [P] in world units along z, both of the same dtype. xy has a
+    meaning only where z > 0, and is not finite at z = 0.
     """
     in_camera = _times(points, camera.rotation.to(points).T) + camera.translation.to(points)
     homogeneous = _times(in_camera, camera.K.to(points).T)
@@ -50,9 +50,9 @@ def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def pixels_under(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Return which points lie in the picture and in front of the camera, and in which pixels.
+    """Return which points lie inside the picture and in front of the camera, and in which pixels.
 
-    points: [P, 3] float. Returns three of [S] int64: places among the points, ascending, rows and columns of pixels.
+    points: [P, 3] float. Returns three tensors [S] int64: indices of the points, ascending; rows; columns.
     """
     xy, z = project(points, camera)
     inside = (z > 0) & (xy >= 0).all(dim=-1) & (xy[:, 0] < camera.width) & (xy[:, 1] < camera.height)
@@ -62,12 +62,12 @@ def pixels_under(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor
 
 
 def project_directions(directions: Tensor, points: Tensor, camera: Camera) -> Tensor:
-    """Return J W d: the pixels, [P, 2], by which a point moves per step along a direction, to first order.
+    """Return J W d, [P, 2] pixels: how far each point moves in the picture per unit step along its direction.
 
-    As in splatting of 3D Gaussians, J is that of the nearest point within ``MARGIN`` of the picture's half width and
-    height, lest it grow without bound.
+    As in 3D Gaussian splatting, J is taken at the nearest point within ``MARGIN`` times the picture's half width and
+    height, because it grows without bound outside.
 
-    directions, points: [P, 3] float, points in front of the camera.
+    directions, points: [P, 3] float, the points in front of the camera.
     """
     W, K = camera.rotation.to(points).T, camera.K.to(points)
     x, y, z = (_times(points, W) + camera.translation.to(points)).unbind(-1)
@@ -79,8 +79,9 @@ def project_directions(directions: Tensor, points: Tensor, camera: Camera) -> Te
 
 
 def _times(rows: Tensor, matrix: Tensor) -> Tensor:
-    """Multiply [..., 3] rows by [3, 3].
+    """Return rows [..., 3] times a matrix [3, 3].
 
-    Determinism: a library's product may differ between machines and numbers of threads."""
+    Determinism: the product of a library may differ between machines and numbers of threads.
+    """
     x, y, z = rows.unbind(-1)
     return torch.stack([x * matrix[0, c] + y * matrix[1, c] + z * matrix[2, c] for c in range(3)], dim=-1)

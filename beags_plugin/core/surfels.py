@@ -1,4 +1,4 @@
-"""A 2D-Gaussian-splatting scene: a set of flat Gaussians (surfels)."""
+"""A scene of 2D Gaussian splatting: N flat Gaussians, which the code calls surfels (method, section 1)."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Surfels:
-    """Parameters of N surfels, as they are optimised (method, section 0).
+    """Parameters of N Gaussians, as they are optimised (method, section 0); all floats, float32 in training.
 
-    means: [N, 3] world positions.
-    quats: [N, 4] wxyz, of any length but zero; normalised where they are used.
-    log_scales: [N, 2] logs of the two scales, world units.
+    means: [N, 3] positions, world units.
+    quats: [N, 4] rotations, wxyz, of any length but zero; normalised where they are used.
+    log_scales: [N, 2] natural logs of the two scales, world units.
     opacity_logits: [N] logits of the opacity.
-    sh_dc: [N, 3] spherical-harmonic coefficients of the colour, degree 0. They learn at a rate of their own.
-    sh_rest: [N, (degree + 1)^2 - 1, 3] those of the higher degrees; joining both would copy it in every step.
+    sh_dc: [N, 3] spherical-harmonic coefficients of the colour, degree 0. They have a learning rate of their own.
+    sh_rest: [N, (degree + 1)^2 - 1, 3] coefficients of the higher degrees. One tensor for all degrees would have to be
+        copied in every step.
     """
 
     means: Tensor
@@ -29,7 +30,7 @@ class Surfels:
 
     @classmethod
     def of(cls, means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, sh: Tensor) -> Surfels:
-        """Make surfels from all coefficients in one tensor: sh [N, (degree + 1)^2, 3], which is not copied."""
+        """Make Gaussians from one tensor of all coefficients, sh [N, (degree + 1)^2, 3], of which they hold views."""
         return cls(means, quats, log_scales, opacity_logits, sh[:, 0], sh[:, 1:])
 
     @property
@@ -46,7 +47,7 @@ class Surfels:
         return self.means.shape[0]
 
     def __getitem__(self, selection) -> Surfels:
-        """Return the surfels that a mask [N] bool, an index [M] int64 or a slice selects."""
+        """Return the Gaussians that a mask [N] bool, an index [M] int64 or a slice selects."""
         return Surfels(**{field.name: getattr(self, field.name)[selection] for field in fields(self)})
 
     def detach(self) -> Surfels:
@@ -59,9 +60,9 @@ class Surfels:
 
 
 def opacities(logits: Tensor) -> Tensor:
-    """Return opacities 0..1 of logits of any shape; differentiable, with a gradient of 0 below logits of -80.
+    """Return opacities in 0..1, of the shape of ``logits``; differentiable, with a gradient of 0 below logits of -80.
 
-    Determinism: torch.sigmoid rounds the ends of each thread's share differently; exp does not. Below -80, where the
-    opacity is 1e-35, 1 / (1 + exp) would have no finite gradient.
+    Below -80, where the opacity is 1e-35, 1 / (1 + exp) would have no finite gradient. Determinism: torch.sigmoid
+    rounds differently at the ends of each thread's share, exp does not.
     """
     return 1.0 / (1.0 + torch.exp(-logits.clamp_min(-80.0)))

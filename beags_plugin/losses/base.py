@@ -1,4 +1,4 @@
-"""The interface of losses: a name, a weight, the steps it is active in, and pure maths."""
+"""The interface of a loss: its weight, the steps in which it is active, and a pure function of ``LossInputs``."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LossInputs:
-    """Inputs of all losses in one training step; each uses what it needs.
+    """The inputs of all losses in one training step; each loss reads what it needs. Floats are float32 in training.
 
     step: training step, from 0.
-    seed: of the run; with the step it decides every random number.
-    surfels: the scene, N surfels, with gradients.
+    seed: seed of the run; with the step it decides every random number.
+    surfels: the scene's N Gaussians, with gradients.
     camera: the view that was rendered.
-    render: the images, with what ``Loss.needs`` names.
-    image: [H, W, 3] the photograph, in 0..1.
-    labels: [H, W] int32 class ids M' of the view, or IGNORE; None if the view has none.
+    render: the rendered images, with what ``Loss.needs`` names.
+    image: [H, W, 3] the photo, in 0..1.
+    labels: [H, W] int32 class ids M' of the view, or IGNORE; None if the view has no mask.
     class_ids: [N] int32, phi; None before assignment.
     grid: the visibility voxel grids; None before refinement.
-    screen_shift: [N, 2] of the render's ``SurfelInputs``, whose gradient says where a base grows; None where none does.
-    draw: renders other surfels than the render's, with geometry, on black; for losses that need a render of their own.
-    members: the surfels of each class; present: ids of the objects in ``labels``, ascending. None where the host does
-        not know them: a loss that needs them reads ``class_ids`` and ``labels``, for which a GPU must wait.
+    screen_shift: [N, 2], that of the render's ``SurfelInputs``; its gradient says where a base grows. None
+        while nothing grows.
+    draw: renders other Gaussians than ``render`` shows, with geometry, on black; for losses with a render of their own.
+    members: the Gaussians of each class, or None. A loss then reads ``class_ids``, for which it must wait on a GPU.
+    present: ids of the objects in ``labels``, ascending, or None. A loss then reads ``labels``, likewise.
     """
 
     step: int
@@ -54,14 +55,14 @@ class LossInputs:
 
 @dataclass(frozen=True)
 class Loss(ABC):
-    """One term of the training loss; final classes add their own options as dataclass fields.
+    """One term of the training loss; a subclass adds its options as dataclass fields.
 
-    weight: factor in the sum.
-    start, stop: active at steps start <= step < stop; stop None means to the end.
+    weight: factor of the term in the sum.
+    start, stop: the term is active at steps start <= step < stop; with stop None, to the end.
     """
 
     needs: ClassVar[frozenset[str]] = frozenset()
-    """What the rasterizer must supply: any of "geometry", "distortion", "boundary"."""
+    """What the rasterizer must render for it: any of "geometry", "distortion", "boundary"."""
 
     weight: float = 1.0
     start: int = 0
@@ -69,7 +70,7 @@ class Loss(ABC):
 
     @property
     def asks_grid_about_background(self) -> bool:
-        """Return whether it looks up the background's voxels; where no term does, the grid is made without them."""
+        """Return whether the term looks up voxels of the background; if none does, the grid has no such voxels."""
         return False
 
     def active(self, step: int) -> bool:
@@ -77,10 +78,10 @@ class Loss(ABC):
         return self.weight != 0.0 and self.start <= step and (self.stop is None or step < self.stop)
 
     def weighted(self, inputs: LossInputs) -> Tensor:
-        """Return the term as it enters the sum; compiled ops scale value and gradients at no cost."""
+        """Return the term times its weight, a scalar; compiled ops scale value and gradients themselves, at no cost."""
         value = self.value(inputs)
         return value if self.weight == 1.0 else self.weight * value
 
     @abstractmethod
     def value(self, inputs: LossInputs) -> Tensor:
-        """Return the unweighted term: a scalar with gradients towards what it supervises."""
+        """Return the unweighted term: a scalar, with gradients to the parameters that it supervises."""

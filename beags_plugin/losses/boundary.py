@@ -1,4 +1,4 @@
-"""The 2D boundary loss: no Gaussian shows where the mask is of another class (method, section 4; paper 3.3; E7)."""
+"""The 2D boundary loss: no Gaussian shows in pixels of another class (method, section 4; paper 3.3; E7)."""
 
 from __future__ import annotations
 
@@ -26,5 +26,5 @@ class BoundaryLoss(Loss):
         if inputs.render.boundary is None:
             raise ValueError("the boundary loss needs a render with a target")
         labelled = (inputs.labels - IGNORE).count_nonzero()  # a third of the time of comparing and summing
-        # As a tensor: of a GPU's, the host would have to wait for the number.
+        # The count stays a tensor: reading the number on the host would make it wait for the GPU.
         return ordered_sum(inputs.render.boundary) / labelled.clamp(min=1)  # B is 0 at IGNORE

@@ -24,11 +24,11 @@ _CHUNK_POINTS = 1 << 16  # points looked up at a time: their temporaries stay in
 class OccupancyLoss(Loss):
     """L = 1 / (N Z) sum_i sum_r o_i G_i(x_r) Q_i(x_r), Q = 1 where D_occ(x_r, V_phi_i) = 0, else 0 (E9).
 
-    Gaussians that no ray sees learn too. Surfels with a parameter that is not finite, or with a scale of 0, count as 0.
-    Memory does not depend on ``samples``. The compiled op computes it where it can; the code here is its reference.
+    Hidden Gaussians learn too. One with a parameter that is not finite, or with a scale of 0, counts as 0. Memory does
+    not depend on ``samples``. The compiled op computes the loss where it can; the code here is its reference.
 
-    samples: Z, points per Gaussian and step, uniform in its UV disc of radius 3.
-    background: share of the weight on the background's Gaussians: 1 as in the paper, 0 leaves them out.
+    samples: Z, points in each Gaussian and step, uniform in its disc of radius 3 in (u, v).
+    background: share of the weight on the Gaussians of the background: 1 as in the paper, 0 leaves them out.
     """
 
     weight: float = 10.0
@@ -58,7 +58,7 @@ class OccupancyLoss(Loss):
         return sum(parts[1:], parts[0]) if parts else self._part(inputs, 0.0, False)
 
     def _part(self, inputs: LossInputs, weight: float, background: bool) -> Tensor:
-        """Return ``weight`` times the loss of the objects, or of the background too, at the same points."""
+        """Return ``weight`` times the loss of the objects, with ``background`` also of the background; same points."""
         surfels, grid, class_ids = inputs.surfels, inputs.grid, inputs.class_ids
         if grid is None or class_ids is None:
             raise ValueError("the occupancy loss needs class ids and a visibility grid")
@@ -89,7 +89,7 @@ class OccupancyLoss(Loss):
 
 @torch.no_grad()
 def _outside(means, quats, log_scales, opacity_logits, class_ids: Tensor, grid: VisibilityGrid) -> Tensor:
-    """Return [M] int64, the Gaussians whose disc is not wholly in valid voxels; the others' loss is exactly 0."""
+    """Return [M] int64, the Gaussians whose disc is not wholly in valid voxels; the loss of others is exactly 0."""
     scales = log_scales.exp()
     half_axes = RADIUS * scales[:, None, :] * rotation_from_quat(quats)[..., :2]  # [N, 3, 2]
     inside = grid.disc_inside(means, half_axes[..., 0], half_axes[..., 1], class_ids)
@@ -99,10 +99,10 @@ def _outside(means, quats, log_scales, opacity_logits, class_ids: Tensor, grid: 
 
 
 class _Occupancy(torch.autograd.Function):
-    """sum_r o G(x_r) Q(x_r) of every Gaussian, [M], with closed-form gradients from six sums over its samples.
+    """Compute sum_r o G(x_r) Q(x_r) of every Gaussian, [M], with closed-form gradients from six sums over its samples.
 
-    The points are constants of the world: with x fixed, u = R0 . (x - p) / s_u and v = R1 . (x - p) / s_v are functions
-    of p, R0, R1, s, and G = exp(-(u^2 + v^2) / 2).
+    The points x are constants in the world: u = R0 . (x - p) / s_u and v = R1 . (x - p) / s_v are functions of p, R0,
+    R1 and s, and G = exp(-(u^2 + v^2) / 2).
     """
 
     @staticmethod
@@ -133,7 +133,7 @@ def _sums(
     means: Tensor, axes_u: Tensor, axes_v: Tensor, class_ids: Tensor, grid: VisibilityGrid,
     seed: int, step: int, gaussians: Tensor, num_samples: int,
 ) -> Tensor:  # fmt: skip
-    """Return sums over the samples of G Q times 1, u, v, u^2, v^2, u v: [6, M]."""
+    """Return [6, M], sums over the samples of G Q times 1, u, v, u^2, v^2 and u v."""
     total = means.new_zeros(6, len(means))
     block = min(max(len(means), 1), _CHUNK_POINTS)
     per_chunk = max(1, _CHUNK_POINTS // block)

@@ -1,9 +1,8 @@
-"""The silhouette loss: an object rendered alone covers nothing beside its mask that could be seen (our extension).
+"""The silhouette loss: an object rendered alone covers nothing visible beside its mask (our extension; section 10).
 
-In the boundary loss (E7), a Gaussian that others cover weighs next to nothing; once the object is extracted, nothing
-covers it, and it shows. This term looks at the object as extraction renders it. It does not ask the object to cover its
-mask: where many masks take in a plinth, the cheapest way would be a spike behind the plinth's surface, which no photo
-contradicts.
+The boundary loss (E7) hardly sees a Gaussian that others cover; once the object is extracted, nothing covers it, and it
+shows. So this term renders the object alone, as extraction does. It does not ask the object to cover its mask: where
+many masks take in a plinth, the cheapest way would be a spike behind the plinth, which no photo contradicts.
 """
 
 from __future__ import annotations
@@ -24,25 +23,25 @@ from beags_plugin.rasterizers.rendering import shape_inputs
 from beags_plugin.system.errors import UserError
 
 EDGE = 3
-"""Voxels of the 27 around a point that a plane fills which ends one voxel before it; up to its edge it fills 6."""
+"""Number of the 27 voxels around a point that a plane fills which ends one voxel before it; at its edge it fills 6."""
 
 SLACK = 0.4
-"""Of a pixel next to another class, which shows both: so much of it may be covered."""
+"""How much alpha is free in a pixel next to another class, since such a pixel shows both."""
 
 
 @dataclass(frozen=True)
 class SilhouetteLoss(Loss):
     """Mean over the labelled pixels of A_c where M' != c, beyond ``SLACK`` at borders, summed over the view's objects.
 
-    A_c is the alpha of the Gaussians of class c rendered alone. Where the object lies behind what the whole scene
-    shows, it may be hidden rightly, and the pixel does not count.
+    A_c is the alpha of the Gaussians of class c rendered alone. A pixel does not count where the object lies behind
+    what the whole scene shows, because there it may be hidden rightly.
 
-    objects: how many objects of the view are rendered each step, chosen at random and counted in proportion; each costs
-        a render of its Gaussians.
-    seen: near a contact the object below goes on behind the other one, too close for TAU. Pixels of other objects do
-        not count where the rendered surface lies behind what the scene shows and D_occ >= seen there (method, section
-        5): that many of the 27 voxels around it were seen as this object's. A plane fills 9. Nor where there are
-        ``EDGE`` of them and no more of the other object's. 0: they all count.
+    objects: how many objects of the view are rendered in each step. They are chosen at random and counted in
+        proportion; each costs a render of its Gaussians.
+    seen: leaves alone the surface that goes on behind another object near a contact, too close to it for TAU. A pixel
+        of another object does not count if the surface there lies behind what the scene shows and at least ``seen`` of
+        the 27 voxels around it were seen as this object's (a plane fills 9). Nor does it if ``EDGE`` of them were, and
+        no more as the other object's. With 0, all such pixels count.
     """
 
     needs: ClassVar[frozenset[str]] = frozenset({"geometry"})
@@ -76,14 +75,14 @@ class SilhouetteLoss(Loss):
         return torch.stack(terms).sum() * share.to(nothing)
 
     def _of_object(self, class_id: int, members: Tensor, known: Tensor, inputs: LossInputs) -> Tensor:
-        """Return the sum over the pixels that count."""
+        """Return the sum over the pixels that count, a scalar. members: [M] int64, the object's Gaussians."""
         assert inputs.draw is not None and inputs.labels is not None
         if len(members) == 0:
             return inputs.render.color.new_zeros(())
         alone = inputs.draw(shape_inputs(inputs.surfels, members), inputs.camera)
         assert alone.depth is not None and alone.median_depth is not None
         assert inputs.render.median_depth is not None
-        # thin parts have no median: their expected depth shows where they are
+        # Thin parts have no median depth; their expected depth shows where they are.
         depth = torch.where(alone.median_depth > 0, alone.median_depth, alone.depth).detach()
         shown = inputs.render.median_depth.detach()
         hidden = (shown > 0) & (depth > (1.0 + TAU) * shown)
@@ -94,11 +93,11 @@ class SilhouetteLoss(Loss):
         return ordered_sum(beyond_slack(torch.where(outside, alone.alpha, 0.0), inputs.labels))
 
     def _own_surface(self, asked: Tensor, depth: Tensor, class_id: int, inputs: LossInputs) -> Tensor:
-        """Return the pixels of ``asked`` at whose ``depth`` [H, W] the object's surface goes on, both [H, W] bool."""
+        """Return the pixels of ``asked`` [H, W] bool at whose ``depth`` [H, W] the object's surface goes on."""
         if inputs.grid is None or inputs.labels is None:
             raise ValueError("the silhouette loss needs labels and a visibility grid where seen > 0")
         points = lift(depth, inputs.camera).reshape(-1, 3)
-        # All pixels, as a GPU would have to say how many are chosen; of those that are not, no voxel is read.
+        # All pixels are passed, since choosing some would make the host wait for the GPU; IGNORE reads no voxel.
         ids = torch.where(asked, class_id, IGNORE).int().reshape(-1)
         others = torch.where(asked, inputs.labels, IGNORE).int().reshape(-1)
         own, other = inputs.grid.count(points, ids), inputs.grid.count(points, others)
@@ -106,7 +105,7 @@ class SilhouetteLoss(Loss):
 
 
 def beyond_slack(wrong: Tensor, labels: Tensor) -> Tensor:
-    """Return ``wrong`` [H, W], at pixels next to another class what exceeds ``SLACK``. labels: [H, W] int, M'."""
+    """Return ``wrong`` [H, W], but only its excess over ``SLACK`` in pixels next to another class of M' [H, W] int."""
     return torch.where(at_border(labels), (wrong - SLACK).clamp_min(0.0), wrong)
 
 

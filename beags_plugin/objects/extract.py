@@ -1,4 +1,4 @@
-"""Extraction as runs: for each object a run folder of its own, and a .ply in the input's world frame (section 8)."""
+"""Extract objects: a run folder and a .ply for each, in the frame of the input poses (method, section 8)."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ from beags_plugin.system.whole_files import write_text_atomically
 
 @dataclass(frozen=True)
 class Extracted:
-    """One extracted run: its name, the paths of its config.yml and .ply, and its number of Gaussians.
+    """One extracted run.
 
-    left_out: Gaussians of the object that do not belong to it; None where none was looked for.
+    name: of the run's folder and .ply. config, ply: paths of its config.yml and .ply. gaussians: how many it has.
+    left_out: Gaussians that were dropped because they do not belong to the object; None if nothing was looked for.
     """
 
     name: str
@@ -54,14 +55,15 @@ def extract_objects(
     data: Path | None = None,
     say: Callable[[str], None] = lambda sentence: None,
 ) -> list[Extracted]:
-    """Write a run and a .ply per object.
+    """Write a run and a .ply for each object, and return what was written, in order.
 
-    config_path: config.yml of a refined (or assigned) run. objects: names; all that have Gaussians but the background
-    if empty. remove: keep all but the object instead. output: folder for the runs; ``extracted/`` in the run by
-    default. progress: receives (done, total) objects. keep_all: keep Gaussians too that do not belong to their object
-    (``cleaning.clean``); with ``remove`` they go with it in any case. data: of the run, if not where they were. say:
-    receives a sentence on objects without Gaussians, if all are asked for. Raises ``UserError`` for an unknown name,
-    before anything is written.
+    config_path: config.yml of a run whose Gaussians have classes. objects: names; if empty, all objects that have
+    Gaussians, but not the background. remove: write the scene without the object instead. output: folder for the runs;
+    ``extracted/`` in the run by default. progress: called with (done, total) objects. keep_all: keep Gaussians too that
+    do not belong to their object (``cleaning.clean``); with ``remove`` they go with it. data: folder of the
+    photos, if they have moved. say: called with a sentence on map coordinates, and, if ``objects`` is empty, on
+    objects without Gaussians. Raises ``UserError``, before anything is written, for an unknown name or an object
+    without Gaussians.
     """
     opened = Run(config_path, data)
     scene, run = opened.assigned, opened.folder
@@ -107,7 +109,7 @@ def extract_objects(
 
 
 def objects_with_gaussians(scene: SavedScene, objects: Sequence[str], run: Path) -> dict[str, int]:
-    """Return name to class id of all classes with Gaussians; raises ``UserError`` if one of ``objects`` has none."""
+    """Return {name: class id} of the classes with Gaussians; raises ``UserError`` if one of ``objects`` has none."""
     ids = {name: index for index, name in scene.classes.items()}
     for name in objects:
         check_choice(name, ids, "object", f" in {run}")
@@ -119,7 +121,7 @@ def objects_with_gaussians(scene: SavedScene, objects: Sequence[str], run: Path)
 
 
 def empty_objects(scene: SavedScene, run: Path) -> dict[str, int]:
-    """Return name to class id of all classes without Gaussians; of an extracted run, which is to lack some, none."""
+    """Return {name: class id} of the classes without Gaussians; nothing for an extracted run, which lacks some."""
     if (run / EXTRACTION_FILE).exists():
         return {}
     there = set(scene.members.present())
@@ -127,13 +129,13 @@ def empty_objects(scene: SavedScene, run: Path) -> dict[str, int]:
 
 
 def said_of_empty(empty: Collection[str], done: str) -> str:
-    """Return a sentence that names objects without Gaussians; done: what would have been done with them."""
+    """Return a sentence on objects without Gaussians. done: what is not done with them, such as "extracted"."""
     names = ", ".join(map(repr, empty))
     return f"no Gaussian belongs to {names}: nothing is {done} of {'it' if len(empty) == 1 else 'them'}."
 
 
 def _rows(state: dict[str, Any], index: Tensor, members: Membership) -> dict[str, Any]:
-    """Return a model's state with the Gaussians ``index`` [M] only, and their classes."""
+    """Return a model's state with the Gaussians ``index`` [M] int64 alone, and their classes."""
     rows = {
         name: value[index] if name == "class_margin" or name.startswith("gauss_params.") else value
         for name, value in state.items()
@@ -144,9 +146,9 @@ def _rows(state: dict[str, Any], index: Tensor, members: Membership) -> dict[str
 
 
 def folder_names(classes: dict[int, str], taken: Collection[str] = ()) -> dict[int, str]:
-    """Return class id to the name of its folder or files, no two the same, also where case is ignored.
+    """Return {class id: name of its folder or files}, no two the same, also on file systems that ignore case.
 
-    Names that would be shared, or are ``taken``, get the id appended, and a number if that is another's name.
+    A name that two classes share, or that is ``taken``, gets the id appended, and a number if that is taken as well.
     """
     plain = {index: file_name(name) for index, name in classes.items()}
     shared = Counter(name.casefold() for name in (*plain.values(), *taken))  # some file systems ignore case
@@ -161,8 +163,8 @@ def folder_names(classes: dict[int, str], taken: Collection[str] = ()) -> dict[i
 
 
 def file_name(name: str) -> str:
-    """Return a class name as part of a path: anything unusual becomes an underscore, dots too, as suffixes have some.
+    """Return a class name as part of a path: what is no letter, digit, hyphen or underscore becomes an underscore.
 
-    So ``cup.compressed`` and ``cup`` cannot share a file where one suffix ends with another.
+    Dots do too. Otherwise ``cup.compressed`` as .ply and ``cup`` as .compressed.ply would be one file.
     """
     return re.sub(r"[^\w-]+", "_", name).strip("_") or "object"

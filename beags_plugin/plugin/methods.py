@@ -1,4 +1,8 @@
-"""The targets of nerfstudio's entry points: one MethodSpecification per preset, built on access."""
+"""The methods that ``ns-train`` lists: one nerfstudio ``MethodSpecification`` per preset.
+
+The entry points in pyproject.toml name attributes of this module, such as ``beags_fast``. Each is made from the file of
+its preset, ``method_configs/beags-fast.toml``, when nerfstudio asks for it.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ from beags_plugin.plugin.presets import load_preset, preset_names
 
 
 def __getattr__(name: str) -> MethodSpecification:
+    """Return the preset ``name``, with underscores for hyphens; raises ``AttributeError`` if there is none."""
     preset = name.replace("_", "-")
     if preset not in preset_names():
         raise AttributeError(f"there is no preset {preset!r}")

@@ -1,4 +1,4 @@
-"""The interface of rasterizers: what they take and return (method, sections 1 and 4; E1 to E4, E6, E7)."""
+"""The interface of a rasterizer: what every backend takes and returns (method, sections 1, 3, 4; E1 to E4, E6, E7)."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE
 
 MIN_ALPHA = 1.0 / 255.0  # weaker contributions are skipped: they are invisible in 8 bits
-LARGEST = 1e18  # world units: surfels larger, or further off in depth, count as broken; their squares overflow float32
+LARGEST = 1e18  # world units: larger or more distant Gaussians count as broken; their squares overflow float32
 MAX_ALPHA = 0.99  # keeps 1 - alpha, a divisor in the backward, away from 0
-MIN_TRANSMITTANCE = 1e-4  # compositing stops before the surfel that would take T below this
+MIN_TRANSMITTANCE = 1e-4  # compositing stops before the Gaussian that would take T below this
 
 FLOATS = ("means", "quats", "log_scales", "opacity_logits", "colors")
-"""Fields of ``SurfelInputs`` that are always there, in the order in which kernels take them."""
+"""Fields of ``SurfelInputs`` that are never None, in the order in which kernels take them."""
 
 
 @dataclass(frozen=True)
 class RasterSettings:
-    """Choice of images to compute, and the scene's depth range.
+    """The images to compute, and the scene's depth range.
 
-    near, far: world units; they scale with the scene. Hits nearer than ``near`` are skipped; both enter the
-        distortion's depth mapping m(d) = far / (far - near) * (1 - near / d).
-    geometry: whether depth, median depth and normal are wanted; if not, they are None and cost nothing.
-    distortion: whether the distortion is wanted.
+    near, far: world units; they scale with the scene. Hits nearer than ``near`` are skipped. The distortion's depth
+        mapping uses both: m(d) = far / (far - near) * (1 - near / d).
+    geometry: whether to compute depth, median depth and normal; without, they are None and cost nothing.
+    distortion: whether to compute the distortion.
     """
 
     near: float
@@ -39,13 +39,13 @@ class RasterSettings:
 
 @dataclass(frozen=True)
 class SurfelInputs:
-    """N surfels to render, with one colour each, for one view; all floats of one dtype (float32 or float64).
+    """N Gaussians to render for one view, with one colour each; all floats of one dtype (float32 or float64).
 
     means [N, 3], quats [N, 4] wxyz, log_scales [N, 2], opacity_logits [N]: as in ``core.surfels.Surfels``.
-    colors: [N, 3] linear RGB as seen from this view.
+    colors: [N, 3] RGB as seen from this view.
     class_ids: [N] int32, phi, or None; needed with ``target``.
-    screen_shift: [N, 2] zeros, or None. A shift of each disc (not of its low-pass filter) across the screen, in halves
-        of the image's width and height. Nothing is ever shifted; the official densification uses its gradient.
+    screen_shift: [N, 2] zeros, or None: a shift of each disc (not of its low-pass filter) across the screen, in halves
+        of the image's width and height. It stays zero; growth of the base uses its gradient, as the official code does.
     """
 
     means: Tensor
@@ -57,17 +57,17 @@ class SurfelInputs:
     screen_shift: Tensor | None = None
 
     def detached(self) -> SurfelInputs:
-        """Return them without gradients and ``screen_shift``."""
+        """Return the same Gaussians without gradients and ``screen_shift``."""
         return SurfelInputs(*(getattr(self, name).detach() for name in FLOATS), class_ids=self.class_ids)
 
     def to(self, dtype: torch.dtype) -> SurfelInputs:
-        """Return them with all floats in another precision."""
+        """Return the same Gaussians with all floats in another precision."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         changed = {name: value.to(dtype) for name, value in values.items() if name != "class_ids" and value is not None}
         return replace(self, **changed)
 
     def checked(self) -> SurfelInputs:
-        """Return itself, contiguous; raise ``ValueError`` for a field of a wrong shape or dtype."""
+        """Return the same Gaussians, contiguous; raises ``ValueError`` for a field of a wrong shape or dtype."""
         n, dtype = self.means.shape[0], self.means.dtype
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"means must be float32 or float64, not {dtype}")
@@ -91,7 +91,7 @@ class SurfelInputs:
 
 
 def map_ids(inputs: SurfelInputs, num_classes: int) -> Tensor:
-    """Return the class ids [N] int32 for a class map; raise ``ValueError`` if any is no class."""
+    """Return the class ids [N] int32 for a class map; raises ``ValueError`` if one is not in 0..num_classes - 1."""
     ids = inputs.class_ids
     if ids is None:
         raise ValueError("class_ids must be given for a class map")
@@ -102,17 +102,17 @@ def map_ids(inputs: SurfelInputs, num_classes: int) -> Tensor:
 
 @dataclass(frozen=True)
 class RasterOutputs:
-    """Images of one view (E4). H, W are the camera's; floats have the inputs' dtype.
+    """The images of one view (E4). H and W are the camera's height and width; floats have the inputs' dtype.
 
     color: [H, W, 3] sum_i w_i c_i + T_end * background.
     alpha: [H, W] A = sum_i w_i.
-    depth: [H, W] expected depth sum_i w_i d_i / A, world units along z; 0 where A = 0. None if not asked for.
-    median_depth: [H, W] depth of the hit at which T passes 0.5; 0 where it never does. No gradient but to that hit.
+    depth: [H, W] expected depth sum_i w_i d_i / A, world units along z; 0 where A = 0. None without ``geometry``.
+    median_depth: [H, W] depth of the hit at which T passes 0.5; 0 where it never does. That hit alone has a gradient.
     normal: [H, W, 3] sum_i w_i n_i in camera space, turned towards the camera (so n . p <= 0); not normalised.
     distortion: [H, W] sum_{j<i} w_i w_j (m_i - m_j)^2, or None.
     boundary: [H, W] B(u) = sum_i w_i [phi_i != M'(u)], 0 at IGNORE (E7), or None without a target.
-    visible: [N] bool, survived culling and reaches at least one tile; what densification counts as seen.
-    num_nonfinite: number of surfels dropped: a parameter is not finite, or the surfel is too large or too far.
+    visible: [N] bool, which Gaussians survive culling and reach a tile; growth of the base counts these as seen.
+    num_nonfinite: number of Gaussians dropped because a parameter is not finite, or they are too large or too far.
     """
 
     color: Tensor
@@ -127,16 +127,16 @@ class RasterOutputs:
 
 
 class Rasterizer(ABC):
-    """One backend. All its methods render surfels with the same weights w_i.
+    """One backend: all its methods render Gaussians with the same weights w_i (E4).
 
-    A backend writes the five abstract methods; what else some refiners of other packages ask for is in
-    ``rasterizers.optional``. Instances hold no scene; they may be kept for the life of the program.
+    A backend writes the five abstract methods. ``rasterizers.optional`` has what only refiners of other packages ask
+    for. An instance holds no scene and may be kept for the life of the program.
     """
 
     @classmethod
     @abstractmethod
     def unavailable(cls) -> str | None:
-        """Return None if this backend can run here, else one sentence: why not and what to install."""
+        """Return None if this backend can run here, else one sentence: why not, and what to install."""
 
     @abstractmethod
     def rasterize(
@@ -147,7 +147,11 @@ class Rasterizer(ABC):
         background: Tensor,  # [3]
         target: Tensor | None = None,  # [H, W] int32 class ids M', or IGNORE
     ) -> RasterOutputs:
-        """Render, differentiably in all float inputs and ``background``; raises ``ValueError`` for a wrong shape."""
+        """Render the Gaussians over a background.
+
+        Differentiable in all floats of ``inputs`` and in ``background``. With ``target``, the outputs have ``boundary``
+        (E7). Raises ``ValueError`` for a wrong shape or dtype.
+        """
 
     @abstractmethod
     def class_contributions(
@@ -158,18 +162,18 @@ class Rasterizer(ABC):
         labels: Tensor,  # [H, W] int32 class ids, or IGNORE
         num_classes: int,
     ) -> Tensor:
-        """Return C[i, c] of this view, [N, num_classes]: the sum of w_i(u) over pixels u with labels(u) = c (E6).
+        """Return C[i, c] of this view: the sum of w_i(u) over the pixels u with labels(u) = c (E6).
 
-        No gradient.
+        Returns [N, num_classes] of the inputs' dtype, without gradient.
         """
 
     def sparse_class_contributions(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, labels: Tensor, num_classes: int
     ) -> tuple[Tensor, Tensor]:
-        """Return what is not zero of ``class_contributions``, as keys [M] int64 and values [M].
+        """Return the non-zero entries of ``class_contributions``: keys [M] int64 and values [M].
 
-        The keys are i * num_classes + c, ascending. A backend should make no table of all classes if it can; this
-        method makes one of the classes that ``labels`` hold.
+        The keys are i * num_classes + c, ascending. This method makes a dense table of the classes that ``labels``
+        hold; a backend that can do without one should override it.
         """
         return sparse_table(
             lambda slots, count: self.class_contributions(inputs, camera, settings, slots, count), labels, num_classes
@@ -179,30 +183,32 @@ class Rasterizer(ABC):
     def class_map(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
     ) -> tuple[Tensor, Tensor]:
-        """Return the class of every pixel, argmax_c sum_i w_i [phi_i = c] (method, section 5), ties to the lower id.
+        """Return the class of every pixel, argmax_c sum_i w_i [phi_i = c], and its share (method, section 5).
 
-        Returns ([H, W] int32, background 0 where nothing is; [H, W] float, the winner's share of A, 0 there). No
-        gradient.
+        Returns [H, W] int32, with ties to the lower id and 0 (background) where nothing is; and [H, W] float, the
+        winner's share of A, 0 where nothing is. Neither has a gradient.
         """
 
     def feature_channels(
         self, inputs: SurfelInputs, features: Tensor, camera: Camera, settings: RasterSettings
     ) -> Tensor | None:
-        """Return what ``rendering.draw_features`` says, in one pass; None where three channels at a time cost less.
+        """Render features as ``rendering.draw_features`` does, but in one pass.
 
-        Surfels whose features are not finite have such colours too.
+        Returns None where rendering three channels at a time costs less. The caller has given every Gaussian with a
+        feature that is not finite such a colour too.
         """
         return None
 
     @abstractmethod
     def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
-        """Return [H, W] int32, the index of the surfel with the largest w_i (ties to the nearer); -1 where none is."""
+        """Return [H, W] int32, the index of the Gaussian with the largest w_i (ties to the nearer), or -1."""
 
 
 def sparse_table(table: Callable[[Tensor, int], Tensor], labels: Tensor, num_classes: int) -> tuple[Tensor, Tensor]:
-    """Return what is not zero of a table by surfel and class, as keys [M] int64 (surfel * num_classes + c) and values.
+    """Return the non-zero entries of a table of Gaussians and classes: keys [M] int64 and values [M].
 
-    table: takes class ids [H, W] int32 or IGNORE and their number, which are those that ``labels`` hold, renumbered.
+    The keys are i * num_classes + c. table: returns [N, count] for renumbered labels [H, W] int32 (or IGNORE) and the
+    number of classes that ``labels`` hold.
     """
     present = torch.unique(labels[(labels >= 0) & (labels < num_classes)])
     columns = torch.searchsorted(present, labels)
