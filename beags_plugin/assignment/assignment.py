@@ -1,4 +1,4 @@
-"""Assignment of each Gaussian to the class to which it contributes most (method, section 3; E6)."""
+"""Assign each Gaussian to the class to which it contributes most (method, section 3; E6)."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 
 @dataclass(frozen=True)
 class Assignment:
-    """Fixed classes of N Gaussians.
+    """The classes of N Gaussians, which refinement does not change.
 
-    class_ids: [N] int32, phi; background (0) if never seen.
+    class_ids: [N] int32, phi; 0 (background) if never seen.
     margin: [N] float32 in 0..1, the class's share of the Gaussian's contributions; 0 if never seen.
-    never_seen: [N] bool, without contribution to a labelled pixel of any view.
+    never_seen: [N] bool, whether the Gaussian contributes to no labelled pixel of any view.
     """
 
     class_ids: Tensor

@@ -1,4 +1,4 @@
-"""Extraction: an object is its Gaussians, every parameter untouched (method, section 8)."""
+"""Select the Gaussians of an object, or all others, with every parameter untouched (method, section 8)."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from beags_plugin.core.surfels import Surfels
 
 
 def select_class(surfels: Surfels, members: Membership, class_id: int) -> tuple[Surfels, Tensor]:
-    """Return the Gaussians of one class: all their parameters.
+    """Return the Gaussians of one class, with all their parameters.
 
-    surfels: N surfels. members: of them.
-    Returns (M surfels, [M] int64 their indices among the N, ascending). Raises ``ValueError`` on a wrong length.
+    surfels: N Gaussians. members: their classes. Returns the M Gaussians of the class and their indices among the N,
+    [M] int64, ascending. Raises ``ValueError`` if ``members`` is of another number of Gaussians.
     """
     return _select(surfels, members, members.of(class_id))
 

@@ -1,4 +1,4 @@
-"""Multiview mask reprojection: every view's labels voted by all views (method, section 2; paper 3.2; E5)."""
+"""Multiview mask reprojection: all views vote on the labels of each view (method, section 2; paper 3.2; E5)."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _DENSE_COUNTERS = 1 << 26  # most (pixel, class) pairs of a view counted in one 
 
 @dataclass(frozen=True)
 class ReprojectedMask:
-    """One view's consistent labels M'.
+    """The labels M' of one view, on which all views agree.
 
     labels: [H, W] int32 class ids or IGNORE.
-    confidence: [H, W] float32 in 0..1, votes of the winner / all votes; 0 without votes.
+    confidence: [H, W] float32 in 0..1, the winner's share of all votes; 0 without votes.
     """
 
     labels: Tensor
@@ -42,14 +42,18 @@ def reproject_pairwise(
     tau: float = TAU,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[ReprojectedMask]:
-    """Give every pixel of every view the class with the most votes by lifted pixels of all views (E5).
+    """Give every pixel of every view the class for which most lifted pixels of all views vote (E5).
 
-    depths: V x [H, W] float, world units along z; 0: nothing rendered. Views may differ in size.
-    labels: V x [H, W] int32 class ids below ``num_classes`` or IGNORE; None without a mask. ``LabelMaps`` stay narrow.
-    tau: a vote counts only if its point is visible, |z - D_i| <= tau z; ``inf`` counts all (the paper's literal text).
+    depths: V x [H, W] float, world units along z; 0 where nothing is rendered. Views may differ in size.
+    labels: V x [H, W] int32 class ids below ``num_classes`` or IGNORE; None for a view without a mask. ``LabelMaps``
+        stay as narrow as they are.
+    tau: a vote counts only if its point is visible, |z - D_i| <= tau z; ``inf`` counts all, as the paper's text says.
+    progress: called with (done, V).
+
     IGNORE pixels and pixels without depth do not vote; a view votes in itself too. A tie or no vote keeps the original
-    label, which is IGNORE in a view without a mask. Cost O(V^2 pixels). Memory: depth and labels of all views (5 bytes
-    a pixel), and O(pixels of one view x classes).
+    label, which is IGNORE in a view without a mask. Time grows with V^2 pixels. Memory holds depth and labels of all
+    views (5 bytes a pixel), and a count for each pixel and class of one view.
+
     Yields the views in order. Raises ``UserError`` for a mask of the wrong size or with ids out of range.
     """
     check_views(depths, cameras, labels, num_classes, tau)
@@ -134,7 +138,7 @@ def check_view(index: int, depth: Tensor, camera: Camera, mask: Tensor | None, n
 
 
 class PixelMaps:
-    """Maps between the pixels of all views: lifting and projection in one step."""
+    """The maps between the pixels of any two views: lifting and projection in one step."""
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
         views = [camera.to("cpu", torch.float64) for camera in cameras]
