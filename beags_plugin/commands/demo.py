@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 BEFORE = ("sample", "poses", "poses and masks", "base training")  # stages before the training that is measured
 PRESET, PRESET_OF_PHOTOS = "beags-tiny", "beags-fast"
+SIZE, DOWNSCALE = (640, 480), 2.5  # of the generated photos, and how whole ones are trained on
+FOCUS = ("--pipeline.datamanager.focus", "auto")  # training on the generated photos
 
 
 def run_demo(
@@ -59,8 +61,8 @@ def run_demo(
         output = output or Path("outputs/demo")
         scene = MadeScene(output / "sample")
         with timed(seconds, "sample"):
-            make_sample(scene.data, seed, 256, 192, "mild")
-        downscale = downscale or 1.0
+            make_sample(scene.data, seed, *SIZE, "mild", views=30, num_test=6, family="desk")
+        downscale = downscale or DOWNSCALE
     else:
         output = output or Path("outputs") / name_of(data)
         if output.resolve() == data.resolve():
@@ -78,26 +80,28 @@ def run_demo(
         assert data is not None
         scene = _trained_by_picks(scene, output, request, names_of(data, objects), fresh, again, seconds)
     else:
-        _trained_by_masks(scene, output, request, fresh)
+        _trained_by_masks(scene, output, request, fresh, FOCUS if data is None else ())
     measure(output / "run", output, seconds, scene, again)
     if pick:
         CONSOLE.print(f"If the objects are not what you meant, pick them again on the same base:\n    {again} --fresh")
 
 
-def _trained_by_masks(scene: MadeScene, output: Path, request: dict[str, Any], fresh: bool) -> None:
-    """Train a scene with the masks that it has."""
+def _trained_by_masks(
+    scene: MadeScene, output: Path, request: dict[str, Any], fresh: bool, words: Sequence[str]
+) -> None:
+    """Train a scene with the masks that it has; words: further options of the training."""
     from beags_plugin.runs.prepared import photos_contradict
 
     request = {**request, "inputs": inputs_digest(scene, output, request["preset"])}
     alone = {**request, "photos": "objects"}
     if scene.turned or (alone in (former := read_stamp(output), former.get(STARTED)) and not fresh):
         request = alone
-    train_once(scene, output, request, fresh)
+    train_once(scene, output, request, fresh, words=words)
     if request != alone and photos_contradict(output / "run"):
         CONSOLE.print(
             "The photos contradict each other outside the masks, as on a turntable: now with the objects' pixels alone."
         )
-        train_once(scene, output, alone, fresh, replace=True)
+        train_once(scene, output, alone, fresh, replace=True, words=words)
 
 
 def _trained_by_picks(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from beags_plugin.sample.arrangement import make_still
+from beags_plugin.sample.desk import DeskLight, desk_views, make_desk
 from beags_plugin.sample.lighting import Light, TurntableLight
 from beags_plugin.sample.room import make_room
 from beags_plugin.sample.room_light import RoomLight
@@ -32,4 +33,5 @@ FAMILIES = {
     "tabletop": Family(make_still, Light, make_views),
     "turntable": Family(make_still, TurntableLight, make_views, turns=True),
     "room": Family(make_room, RoomLight, room_views),
+    "desk": Family(make_desk, DeskLight, desk_views),
 }

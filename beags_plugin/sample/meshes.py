@@ -95,9 +95,14 @@ class Mesh:
 
     def _cast(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the rays that hit and the triangles that they hit first."""
-        triangle = self.caster.cast_rays(rays(origins, directions))["primitive_ids"].numpy()
+        return self._cast_to(origins, directions)[:2]
+
+    def _cast_to(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the rays that hit, the triangles that they hit first, and where: weights [M, 2] of corners 1 and 2."""
+        found = self.caster.cast_rays(rays(origins, directions))
+        triangle = found["primitive_ids"].numpy()
         hit = np.flatnonzero(triangle < len(self.triangles))
-        return hit, triangle[hit].astype(np.int64)
+        return hit, triangle[hit].astype(np.int64), found["primitive_uvs"].numpy()[hit]
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return [N] smallest t > 0 at which rays from outside enter the body, infinity if none."""
@@ -112,11 +117,18 @@ class Mesh:
 
     def normals(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return [N, 3] outward unit normals at surface points that rays along ``directions`` [N, 3] hit first."""
-        way = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-        hit, triangle = self._cast(points - 1e-3 * way, way)
-        normals = -way  # where rounding lets the ray slip past an edge
-        normals[hit] = self.face_normals[triangle]
+        hit, triangle, _ = self.land(points, directions)
+        normals = -directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        normals[hit] = self.face_normals[triangle]  # where rounding does not let the ray slip past an edge
         return normals
+
+    def land(self, points: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Find surface points that rays along ``directions`` [N, 3] hit first: which, on which triangle, and where.
+
+        Returns indices [M], triangles [M] and the weights [M, 2] of these triangles' corners 1 and 2.
+        """
+        way = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        return self._cast_to(points - 1e-3 * way, way)
 
 
 def rays(origins: np.ndarray, directions: np.ndarray) -> Any:
@@ -134,4 +146,5 @@ def raycaster(parts: list[Part]) -> Any:
     scene, tensor = open3d.t.geometry.RaycastingScene(), open3d.core.Tensor
     for vertices, triangles in parts:
         scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(triangles.astype(np.uint32)))
+    scene.cast_rays(tensor(np.zeros((1, 6), np.float32)))  # The first rays build its tree, which no two threads may do.
     return scene

@@ -76,7 +76,15 @@ def make_room(seed: int) -> Room:
     for group, slot in zip(groups, generator.permutation(np.array(SLOTS)), strict=True):
         place = np.array([*(slot + generator.uniform(-0.03, 0.03, 2)), 0.0])
         turn = shell.turn @ turn_z(generator.uniform(0.0, 2.0 * np.pi))
-        _add(things, contacts, group, turn, shell.turn @ place)
+        add_group(things, contacts, group, turn, shell.turn @ place)
+    return furnished(things, contacts, shell, generator, noise, hue)
+
+
+def furnished(
+    things: list[Thing[Mesh]], contacts: list[Contact], shell: Shell, generator: np.random.Generator, noise: Noise,
+    hue: float,
+) -> Room:  # fmt: skip
+    """Return a room with these things on its table."""
     return Room(
         things=tuple(things),
         contacts=tuple(contacts),
@@ -86,7 +94,10 @@ def make_room(seed: int) -> Room:
     )
 
 
-def _add(things: list[Thing[Mesh]], contacts: list[Contact], group: Group, turn: np.ndarray, place: np.ndarray) -> None:
+def add_group(
+    things: list[Thing[Mesh]], contacts: list[Contact], group: Group, turn: np.ndarray, place: np.ndarray
+) -> None:
+    """Add a group with its contacts, turned and then moved to ``place`` [3], to what a scene has so far."""
     ids = {"table": 0}
     for thing in group.things:
         things.append(

@@ -43,11 +43,12 @@ def superellipse(x: float, y: float, power: float, count: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Stock:
-    """What things are made with: random sizes and colours near one hue, and the noise of prints."""
+    """What things are made with: random sizes, colours within ``spread`` turns of one hue, and the noise of prints."""
 
     generator: np.random.Generator
     noise: Noise
     hue: float
+    spread: float = 0.2
 
     def about(self, value: float) -> float:
         """Return a size that differs by up to 8 %."""
@@ -55,7 +56,7 @@ class Stock:
 
     def colours(self) -> tuple[np.ndarray, np.ndarray]:
         """Return a light and a dark colour, linear RGB; colour alone does not tell the objects apart."""
-        tint = self.hue + self.generator.uniform(-0.2, 0.2)
+        tint = self.hue + self.generator.uniform(-self.spread, self.spread)
         return linear_from_hsv(tint, self.generator.uniform(0.3, 0.6), 0.9), linear_from_hsv(tint + 0.08, 0.7, 0.36)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +14,10 @@ from beags_plugin.sample.families import Family
 from beags_plugin.sample.lots import lowest_lots
 from beags_plugin.sample.scene import Lighting, Scene
 from beags_plugin.sample.tracing import first_hits
-from beags_plugin.sample.views import Picture, View, pixel_directions
+from beags_plugin.sample.views import Picture, View, pixel_directions, render_view
 from beags_plugin.sample.visitors import with_visitor
+
+AHEAD = 2  # pictures that are rendered beside each other, each by a thread
 
 
 @dataclass(frozen=True)
@@ -56,3 +61,16 @@ def plan_shots(
         exposed = own if (gains[view.name] == 1.0).all() else Exposed(own, gains[view.name])
         shots.append(Shot(view, still, scene, own, exposed))
     return shots
+
+
+def taken(shots: Sequence[Shot], samples: int) -> Iterator[tuple[Shot, Picture]]:
+    """Yield each shot with its picture, in order, while the next ones are rendered; samples: see ``render_view``."""
+    waiting: deque[tuple[Shot, Future[Picture]]] = deque()
+    with ThreadPoolExecutor(AHEAD) as pool:
+        for shot in shots:
+            waiting.append((shot, pool.submit(render_view, shot.scene, shot.exposed, shot.view, samples)))
+            if len(waiting) > AHEAD:
+                first, picture = waiting.popleft()
+                yield first, picture.result()
+        for last, picture in waiting:
+            yield last, picture.result()

@@ -19,8 +19,8 @@ from beags_plugin.sample.families import FAMILIES
 from beags_plugin.sample.points import SeedPoints, find_tracks, seed_points
 from beags_plugin.sample.seen import Photo, seen_part, shown_points, visible_surface, well_seen
 from beags_plugin.sample.shared_damage import flawed_mask, plan_flaws
-from beags_plugin.sample.shots import Shot, plan_shots
-from beags_plugin.sample.views import Picture, View, render_pixels, render_removed, render_view, surface_without
+from beags_plugin.sample.shots import Shot, plan_shots, taken
+from beags_plugin.sample.views import Picture, View, render_pixels, render_removed, surface_without
 from beags_plugin.system.errors import UserError, check_choice, unwritable, writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.reading.ply import write_vertices
@@ -38,7 +38,8 @@ class SampleConfig:
     """Options that decide every byte of the sample.
 
     family: of scenes: "tabletop" (solids on the ground, seen from all sides), "turntable" (the same views of the same
-        solids, which turn while ground and curtain stand) or "room" (a closed room, see ``room``).
+        solids, which turn while ground and curtain stand), "room" (a closed room, see ``room``) or "desk" (textured
+        things that touch in such a room, see ``desk``).
     seed: of arrangement, sizes, colours, textures, light, camera jitter, mask degradation.
     width, height: pixels. num_train, num_test: views.
     degradation: of the train masks: "none", "mild", "strong", a degree as text ("1.5"), or a ``Degradation``.
@@ -173,9 +174,8 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
     surfaces: list[list[np.ndarray]] = [[] for _ in shots[0].still.things]
     photos: list[Photo] = []  # those to train on
     silhouettes: dict[str, np.ndarray] = {}
-    for done, shot in enumerate(shots, start=1):
+    for done, (shot, picture) in enumerate(taken(shots, config.antialias), start=1):
         view, scene = shot.view, shot.scene
-        picture = render_view(scene, shot.exposed, view, config.antialias)
         _write_truth(folder, view, picture, names)
         _write_png(folder / "images" / f"{view.name}.png", picture.image)
         mask = picture.labels

@@ -1,0 +1,150 @@
+"""A desk in the room: seven of the room's things put together so that they touch, for photos from all around."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from threading import Lock
+
+import numpy as np
+
+from beags_plugin.sample.arrangement import turn_z
+from beags_plugin.sample.light_map import LightMap
+from beags_plugin.sample.meshes import SEGMENTS, Mesh, block
+from beags_plugin.sample.room import SHELL, Room, Shell, add_group, furnished
+from beags_plugin.sample.room_light import SHARES, RoomLight
+from beags_plugin.sample.room_things import Group, Stock, make_groups
+from beags_plugin.sample.scene import Contact, Thing
+from beags_plugin.sample.solids import turned
+from beags_plugin.sample.textures import Noise
+from beags_plugin.sample.views import View, held_out, look_at, make_view
+
+ELEVATIONS = (0.24, 0.52, 0.84)
+"""Radians above the desk of the three rounds of cameras."""
+TARGET = np.array([0.0, 0.0, 0.16])
+DISTANCE, LENS = 1.70, 1.22
+"""World units from the target, so that cameras stand before the nearest wall; focal length over width."""
+TABLE = -1  # part of the background, see ``Room``
+SPACING_THINGS, SPACING_TABLE, SPACING_ROOM = 0.012, 0.03, 0.1
+"""World units between the places where light is measured."""
+
+
+def make_desk(seed: int) -> Room:
+    """Make the desk of a seed, which decides sizes, places, turns, textures and colours.
+
+    A book leans on a crate with a star on it; a mug with a spoon, a vase and a ball touch the crate's other sides.
+    """
+    generator = np.random.default_rng([seed, 14])
+    shell = Shell.of(seed)
+    noise = Noise(generator)
+    hue = float(generator.uniform())
+    boxes, mug, basket, vase, _ = make_groups(Stock(generator, noise, hue, spread=0.5))
+    crate = boxes.things[0]
+    ball = next(thing for thing in basket.things if thing.name == "ball")
+    x, y = crate.solid.vertices[:, :2].max(axis=0)
+    turn = shell.turn @ turn_z(generator.uniform(0.0, 2.0 * np.pi))
+    middle = crate.position * [1.0, 1.0, 0.0]
+    things: list[Thing[Mesh]] = []
+    contacts: list[Contact] = []
+    add_group(things, contacts, boxes, turn, -turn @ middle)
+    # The mug's handle points away from the crate's west side, along which the others do not stand; so does the spoon.
+    for group, face, steps, along in (
+        (mug, 0.5 * np.pi, 0, generator.uniform(-0.05, 0.05)),
+        (vase, 0.0, generator.integers(SEGMENTS), generator.uniform(-0.07, 0.0)),
+        (_rolled(ball), np.pi, generator.integers(SEGMENTS), generator.uniform(-0.02, 0.06)),
+    ):
+        way = turn_z(face)  # y is away from the crate
+        gap = x if face == 0.5 * np.pi else y
+        spin = turn_z(2.0 * np.pi * steps / SEGMENTS)
+        solid = group.things[0].solid
+        local = turned(solid.vertices, spin.T)
+        nearest = local[np.argmin(local[:, 1].round(9))]
+        shift = np.array([along, gap - nearest[1], 0.0])
+        first = len(things) + 1
+        add_group(things, contacts, group, turn @ way @ spin, turn @ way @ shift)
+        lift = group.things[0].position + [0.0, 0.0, nearest[2]]
+        contacts.append(Contact(first, 1, turn @ way @ (shift + nearest * [1.0, 1.0, 0.0] + lift)))
+    return furnished(things, contacts, shell, generator, noise, hue)
+
+
+def _rolled(ball: Thing[Mesh]) -> Group:
+    """Return a ball that lies on the table."""
+    group = Group()
+    radius = float(-ball.solid.vertices[:, 2].min())
+    group.place("ball", ball.solid, ball.texture, (0.0, 0.0, radius))
+    group.touch("ball", "table", 0.0, 0.0, 0.0)
+    return group
+
+
+class DeskLight(RoomLight):
+    """The light of a room, measured once on a grid over all surfaces: many photos need no further rays for it."""
+
+    def __init__(self, room: Room, lamp_samples: int = 24, bounce_samples: int = 16) -> None:
+        super().__init__(room, lamp_samples, bounce_samples)
+        self._maps: dict[int, LightMap] = {}
+        self._lock = Lock()
+
+    def colours(
+        self, points: np.ndarray, surface: np.ndarray, directions: np.ndarray, center: np.ndarray
+    ) -> np.ndarray:
+        """See ``scene.Lighting``."""
+        colours = np.empty_like(points)
+        for which in np.unique(surface):
+            on = np.flatnonzero(surface == which)
+            if which == SHELL:
+                shell = self.room.shell
+                local, way = shell.to_local(points[on]), turned(directions[on], shell.turn)
+                albedo = self._shell(points[on])[0]
+            else:
+                thing = self._thing(which)
+                local, way = thing.to_local(points[on]), turned(directions[on], thing.rotation)
+                albedo = thing.texture(local)
+            colours[on] = albedo * self._map(int(which)).read(local, way)
+        return colours
+
+    def _thing(self, which: int) -> Thing[Mesh]:
+        return self.room.things[which - 1] if which > 0 else self.room.fixtures[-1 - which]
+
+    def _map(self, which: int) -> LightMap:
+        """Return the light of a part, as in ``Hits.surface``, which its first reader has measured."""
+        with self._lock:
+            if which not in self._maps:
+                self._maps[which] = self._baked(which)
+            return self._maps[which]
+
+    def _baked(self, which: int) -> LightMap:
+        if which == SHELL:
+            shell = self.room.shell
+            vertices, triangles = block(shell.half[0], shell.half[1], -shell.half[2], shell.half[2])
+            inwards = Mesh((vertices, triangles[:, ::-1]))
+            return LightMap(inwards, SPACING_ROOM, self._measure(shell.turn, shell.turn @ shell.middle))
+        thing = self._thing(which)
+        spacing = SPACING_THINGS if which > 0 else SPACING_TABLE if which == TABLE else SPACING_ROOM
+        return LightMap(thing.solid, spacing, self._measure(thing.rotation, thing.position))
+
+    def _measure(self, rotation: np.ndarray, position: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        """Return what measures light in the frame of a thing, by all of the lamp and all ways around."""
+
+        def measure(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+            places, ways = turned(points, rotation.T) + position, turned(normals, rotation.T)
+            return np.mean([self._light(places, ways, np.full(len(places), share)) for share in range(SHARES)], axis=0)
+
+        return measure
+
+
+def desk_views(seed: int, width: int, height: int, num_train: int, num_test: int) -> list[View]:
+    """Make three jittered rounds about the desk at rising height, with test views spread evenly."""
+    generator = np.random.default_rng([seed, 2])
+    total, tests = num_train + num_test, held_out(num_train, num_test)
+    start = generator.uniform(0.0, 2.0 * np.pi)
+    views = []
+    for i in range(total):
+        progress = i * len(ELEVATIONS) / total
+        level = int(progress)
+        spread = generator.uniform(-1.0, 1.0, 7)
+        azimuth = start + 2.0 * np.pi * (progress + level / 8.0) + 0.05 * spread[0]
+        elevation = ELEVATIONS[level] + 0.04 * spread[1]
+        way = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+        target = TARGET + 0.05 * spread[2:5]
+        pose = look_at(target + DISTANCE * (1.0 + 0.04 * spread[5]) * way, target, 0.04 * spread[6])
+        views.append(make_view(i, i in tests, pose, LENS, width, height))
+    return views
