@@ -9,7 +9,7 @@ import numpy as np
 
 from beags_plugin.sample.arrangement import turn_z
 from beags_plugin.sample.light_map import LightMap
-from beags_plugin.sample.meshes import SEGMENTS, Mesh, block
+from beags_plugin.sample.meshes import SEGMENTS, Mesh, block, rays
 from beags_plugin.sample.room import SHELL, Room, Shell, add_group, furnished
 from beags_plugin.sample.room_light import SHARES, RoomLight
 from beags_plugin.sample.room_things import Group, Stock, make_groups
@@ -82,6 +82,8 @@ class DeskLight(RoomLight):
         super().__init__(room, lamp_samples, bounce_samples)
         self._maps: dict[int, LightMap] = {}
         self._lock = Lock()
+        parts = [*range(1, len(room.things) + 1), *(-1 - i for i in range(len(room.fixtures))), SHELL]
+        self._parts = {which: number for number, which in enumerate(parts)}  # as ``RoomLight`` gives them to Open3D
 
     def colours(
         self, points: np.ndarray, surface: np.ndarray, directions: np.ndarray, center: np.ndarray
@@ -93,13 +95,29 @@ class DeskLight(RoomLight):
             if which == SHELL:
                 shell = self.room.shell
                 local, way = shell.to_local(points[on]), turned(directions[on], shell.turn)
-                albedo = self._shell(points[on])[0]
             else:
                 thing = self._thing(which)
                 local, way = thing.to_local(points[on]), turned(directions[on], thing.rotation)
-                albedo = thing.texture(local)
-            colours[on] = albedo * self._map(int(which)).read(local, way)
+            colours[on] = self._albedo(which, local) * self._map(which).read(local, way)
         return colours
+
+    def seen(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """See ``scene.DirectLighting``."""
+        found = self._blockers.cast_rays(rays(origin[None], directions))
+        part, triangle = (found[name].numpy().astype(np.int64) for name in ("geometry_ids", "primitive_ids"))
+        weights, colours = found["primitive_uvs"].numpy().astype(np.float64), np.zeros_like(directions)
+        for which, number in self._parts.items():
+            on = np.flatnonzero(part == number)  # A ray that slips through an edge of the shell stays black.
+            if len(on):
+                light = self._map(which)
+                corners = light.mesh.vertices[light.mesh.triangles[triangle[on]]]
+                first, second = weights[on, :1], weights[on, 1:]
+                local = corners[:, 0] * (1.0 - first - second) + corners[:, 1] * first + corners[:, 2] * second
+                colours[on] = self._albedo(which, local) * light.at(triangle[on], weights[on])
+        return colours
+
+    def _albedo(self, which: int, local: np.ndarray) -> np.ndarray:
+        return self._paper(local) if which == SHELL else self._thing(which).texture(local)
 
     def _thing(self, which: int) -> Thing[Mesh]:
         return self.room.things[which - 1] if which > 0 else self.room.fixtures[-1 - which]
@@ -114,8 +132,8 @@ class DeskLight(RoomLight):
     def _baked(self, which: int) -> LightMap:
         if which == SHELL:
             shell = self.room.shell
-            vertices, triangles = block(shell.half[0], shell.half[1], -shell.half[2], shell.half[2])
-            inwards = Mesh((vertices, triangles[:, ::-1]))
+            inwards = Mesh(block(shell.half[0], shell.half[1], -shell.half[2], shell.half[2]))
+            inwards.face_normals *= -1.0
             return LightMap(inwards, SPACING_ROOM, self._measure(shell.turn, shell.turn @ shell.middle))
         thing = self._thing(which)
         spacing = SPACING_THINGS if which > 0 else SPACING_TABLE if which == TABLE else SPACING_ROOM

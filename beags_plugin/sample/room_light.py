@@ -80,13 +80,18 @@ class RoomLight:
         return albedo * self._light(points, normals, np.arange(len(points)) % SHARES)
 
     def _shell(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return albedo and normals of walls, floor and ceiling; the panel is so bright that it needs no light."""
+        """Return albedo and normals of walls, floor and ceiling."""
         shell = self.room.shell
         local = shell.to_local(points)
         axis = np.argmax(np.abs(local) / shell.half, axis=1)
         rows = np.arange(len(points))
         normals = np.zeros_like(points)
         normals[rows, axis] = -np.sign(local[rows, axis])
-        place = np.abs(local[:, :2] + shell.middle[:2])
-        panel = (axis == 2) & (local[:, 2] > 0.0) & (place < PANEL).all(axis=1)
-        return np.where(panel[:, None], 10.0, self.room.walls(local)), turned(normals, shell.turn.T)
+        return self._paper(local), turned(normals, shell.turn.T)
+
+    def _paper(self, local: np.ndarray) -> np.ndarray:
+        """Return the shell's albedo at points [N, 3] in its frame; the panel is so bright that it needs no light."""
+        shell = self.room.shell
+        ceiling = (np.argmax(np.abs(local) / shell.half, axis=1) == 2) & (local[:, 2] > 0.0)
+        panel = ceiling & (np.abs(local[:, :2] + shell.middle[:2]) < PANEL).all(axis=1)
+        return np.where(panel[:, None], 10.0, self.room.walls(local))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -78,4 +78,13 @@ class Lighting(Protocol):
 
         surface: [N], as in ``Hits.surface``. center: [3], the camera's position.
         """
+        ...
+
+
+@runtime_checkable
+class DirectLighting(Protocol):
+    """A light that casts the rays of a photo itself, since it knows where on its surfaces they end."""
+
+    def seen(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Return what ``Lighting.colours`` gives, for rays from ``origin`` [3] along ``directions`` [N, 3]."""
         ...

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beags_plugin.sample.scene import Lighting, Scene
+from beags_plugin.sample.scene import DirectLighting, Lighting, Scene
 from beags_plugin.sample.solids import turned
 from beags_plugin.sample.tracing import CHUNK, first_hits, object_hits
 
@@ -174,8 +174,11 @@ def _pixels(
     pieces = []
     for start in range(0, len(directions), chunk):
         part = directions[start : start + chunk]
-        hits, _ = first_hits(scene, view.center, part, without)
-        colours = light.colours(view.center + hits.t[:, None] * part, hits.surface, part, view.center)
+        if without is None and isinstance(light, DirectLighting):
+            colours = light.seen(view.center, part)
+        else:
+            hits, _ = first_hits(scene, view.center, part, without)
+            colours = light.colours(view.center + hits.t[:, None] * part, hits.surface, part, view.center)
         pieces.append(np.minimum(colours, 1.0).reshape(-1, per_pixel, 3).mean(axis=1))
     return np.floor(255.0 * np.concatenate(pieces) ** (1.0 / 2.2) + 0.5).astype(np.uint8)
 

@@ -10,6 +10,7 @@ from scene_distances import distance
 
 from beags_benchmarks.experiments.scenes import SEEDS
 from beags_plugin.core.cameras import viewmat_from_opengl
+from beags_plugin.sample.desk import make_desk
 from beags_plugin.sample.meshes import Mesh, block, extrude, lathe, sweep
 from beags_plugin.sample.room import make_room
 from beags_plugin.sample.room_light import RoomLight
@@ -19,6 +20,7 @@ from beags_plugin.sample.tracing import first_hits
 from beags_plugin.sample.views import render_view
 
 LEANING = {("book", "crate"), ("star", "crate"), ("spoon", "mug"), ("ball", "basket")}
+TOUCHING = {*LEANING - {("ball", "basket")}, ("mug", "crate"), ("vase", "crate"), ("ball", "crate")}
 
 
 def volume(mesh):
@@ -49,14 +51,16 @@ def room(request):
     return request.param, make_room(request.param)
 
 
-def test_things_touch_where_they_should_and_nowhere_run_into_one_another(room):
-    _, made = room
+@pytest.mark.parametrize("seed", SEEDS["choosing"])
+@pytest.mark.parametrize(("make", "touching"), [(make_room, LEANING), (make_desk, TOUCHING)])
+def test_things_touch_where_they_should_and_nowhere_run_into_one_another(make, touching, seed):
+    made = make(seed)
     names = made.class_names
     for contact in made.contacts:
         for class_id in (contact.first, contact.second):
             off = distance(made.things[class_id - 1], contact.point[None])[0] if class_id else contact.point[2]
             assert abs(off) < 1e-9
-    assert {(names[c.first], names[c.second]) for c in made.contacts if c.second} == LEANING
+    assert {(names[c.first], names[c.second]) for c in made.contacts if c.second} == touching
     assert set(names) - {0} == {c.first for c in made.contacts}
     generator = np.random.default_rng(0)
     for thing in made.things:
