@@ -37,7 +37,7 @@ CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may ho
 BEFORE = ("sample", "poses", "poses and masks", "base training")  # stages before the training that is measured
 PRESET, PRESET_OF_PHOTOS = "beags-tiny", "beags-fast"
 SIZE, DOWNSCALE = (640, 480), 2.5  # of the generated photos, and how whole ones are trained on
-FOCUS = ("--pipeline.datamanager.focus", "auto")  # training on the generated photos
+GENERATED = ("--pipeline.datamanager.focus", "auto", "--pipeline.datamanager.dense-seeds", "off")  # of such photos
 
 
 def run_demo(
@@ -61,7 +61,7 @@ def run_demo(
         output = output or Path("outputs/demo")
         scene = MadeScene(output / "sample")
         with timed(seconds, "sample"):
-            make_sample(scene.data, seed, *SIZE, "mild", views=30, num_test=6, family="desk")
+            make_sample(scene.data, seed, *SIZE, "mild", views=30, num_test=6, num_points=6000, family="desk")
         downscale = downscale or DOWNSCALE
     else:
         output = output or Path("outputs") / name_of(data)
@@ -80,7 +80,7 @@ def run_demo(
         assert data is not None
         scene = _trained_by_picks(scene, output, request, names_of(data, objects), fresh, again, seconds)
     else:
-        _trained_by_masks(scene, output, request, fresh, FOCUS if data is None else ())
+        _trained_by_masks(scene, output, request, fresh, GENERATED if data is None else ())
     measure(output / "run", output, seconds, scene, again)
     if pick:
         CONSOLE.print(f"If the objects are not what you meant, pick them again on the same base:\n    {again} --fresh")

@@ -15,7 +15,7 @@ from beags_plugin.evaluation.records import EvalView
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 from beags_plugin.labels.colors import colorize
 from beags_plugin.pictures.cells import GAP, below, cell, wrapped
-from beags_plugin.pictures.object_cells import COLUMNS, Drawing, as_bytes, object_cells
+from beags_plugin.pictures.object_cells import COLUMNS, Drawing, as_bytes, cell_size, object_shots
 from beags_plugin.rasterizers.rendering import surfel_inputs
 
 _WIDTH = 1920  # pixels of a sheet, if no object needs more; what does not fit goes on below
@@ -32,7 +32,7 @@ def contact_sheet(
     background: Tensor | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> np.ndarray:
-    """Return [H, W, 3] uint8: photo, mask and render of some views, then the cells of each object (``object_cells``).
+    """Return [H, W, 3] uint8: photo, mask and render of some views, then the cells of each object (``object_shots``).
 
     views: held-out ones. cameras: of the training photos. scene: all Gaussians. objects: id to stage (such as before)
     to its Gaussians alone; those without any are left out. classes: id to name. background: [3], behind the scene;
@@ -54,10 +54,12 @@ def contact_sheet(
             progress(len(done), total)
         return cells
 
-    blocks = []
-    for class_id, stages in objects.items():
-        name = classes.get(class_id, f"object {class_id}")
-        blocks.append(finished([object_cells(class_id, name, stages, views, cameras, drawing)]))
+    shots = [
+        object_shots(class_id, classes.get(class_id, f"object {class_id}"), stages, views, cameras, drawing)
+        for class_id, stages in objects.items()
+    ]
+    side = cell_size(shots)
+    blocks = [finished([each.cells(side, drawing)]) for each in shots]
     width = max([_WIDTH, *(block.shape[1] for (block,) in blocks)])
     size = width // COLUMNS - GAP
     groups = [finished(_scene_cells(view, scene, drawing, background, size)) for view in chosen]

@@ -22,7 +22,7 @@ from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.surfaces.frames import bounding_box
 
 COLUMNS = 6  # cells of a line
-SMALLEST, LARGEST = 150, 480  # pixels: sides of a cell, where the object has fewer or more in the photos
+SMALLEST, LARGEST = 150, 480  # pixels: sides of a cell, where the objects have fewer or more in the photos
 FAINT = 0.1  # alpha from which a stray splat widens the crop
 _VIEWS = 2  # each with its photo, before and after: they fill a line
 _PROBE, _ROOM = 160, 3.0  # pixels, and sides of the object's box, in which stray splats are looked for
@@ -48,18 +48,48 @@ class _Shot:
     photo: np.ndarray | None = None
 
 
-def object_cells(
+@dataclass(frozen=True)
+class ObjectShots:
+    """The pictures to take of an object. stages: caption to its Gaussians alone. pixels: side of the renders, as many
+    as the photos' files have there, at most ``LARGEST``."""
+
+    name: str
+    stages: Mapping[str, Surfels]
+    shots: Sequence[_Shot]
+    pixels: int
+
+    def cells(self, size: int, drawing: Drawing) -> np.ndarray:
+        """Return [H, W, 3] uint8: lines of ``COLUMNS`` cells, ``size`` pixels wide."""
+        pixels, groups = min(self.pixels, size), []
+        for shot in self.shots:
+            photo = [] if shot.photo is None else [cell(shot.photo, (size, size), f"{self.name}, {shot.caption}")]
+            renders = []
+            for stage, surfels in self.stages.items():
+                image = alone(surfels, _sized(shot.camera, pixels), shot.settings, drawing.rasterizer)
+                caption = stage if photo else f"{shot.caption}: {stage}"
+                renders.append(cell(over_board(image, size), (size, size), caption))
+            groups.append([*photo, *renders])
+        return below(wrapped(groups, COLUMNS * (size + GAP)))
+
+
+def cell_size(objects: Sequence[ObjectShots]) -> int:
+    """Return the side of the cells of a sheet, one for all, so that its lines end together: what the middle one has."""
+    return max(round(float(np.median([each.pixels for each in objects]))), SMALLEST) if objects else LARGEST
+
+
+def object_shots(
     class_id: int,
     name: str,
     stages: Mapping[str, Surfels],
     views: Sequence[EvalView],
     cameras: Sequence[Camera],
     drawing: Drawing,
-) -> np.ndarray:
-    """Return [H, W, 3] uint8: lines of ``COLUMNS`` cells, at the resolution that the photos' files have of the object.
+) -> ObjectShots:
+    """Return the pictures to take of an object, at the resolution that the photos' files have of it.
 
-    The first has two held-out photos from sides far apart, and the object there at each stage; the second two sides
-    from below the horizon, and the one that photos show least. Crops hold all of the object that is drawn, strays too.
+    The first line has two held-out photos from sides far apart, and the object there at each stage; the second two
+    sides from below the horizon, and the one that photos show least. Crops hold all of the object that is drawn, strays
+    too.
 
     stages: caption to the object's Gaussians alone; the last one that has any says where it is. views: held-out ones;
     those that do not show the object are left out. cameras: of the training photos.
@@ -75,17 +105,7 @@ def object_cells(
         ("least shown side", side(stand, back, _LEVEL)),
     ):
         shots.append(_from_side(stand, caption, away, pixels, stages, drawing))
-    size = max(pixels, SMALLEST)
-    groups = []
-    for shot in shots:
-        photo = [] if shot.photo is None else [cell(shot.photo, (size, size), f"{name}, {shot.caption}")]
-        renders = []
-        for stage, surfels in stages.items():
-            image = alone(surfels, _sized(shot.camera, pixels), shot.settings, drawing.rasterizer)
-            caption = stage if photo else f"{shot.caption}: {stage}"
-            renders.append(cell(over_board(image, size), (size, size), caption))
-        groups.append([*photo, *renders])
-    return below(wrapped(groups, COLUMNS * (size + GAP)))
+    return ObjectShots(name, stages, shots, pixels)
 
 
 def views_of(stand: OrbitFrame, views: Sequence[EvalView]) -> list[int]:

@@ -1,4 +1,4 @@
-"""A desk in the room: seven of the room's things put together so that they touch, for photos from all around."""
+"""A desk in the room: six of the room's things put together so that they touch, for photos from all around."""
 
 from __future__ import annotations
 
@@ -31,47 +31,41 @@ SPACING_THINGS, SPACING_TABLE, SPACING_ROOM = 0.012, 0.03, 0.1
 def make_desk(seed: int) -> Room:
     """Make the desk of a seed, which decides sizes, places, turns, textures and colours.
 
-    A book leans on a crate with a star on it; a mug with a spoon, a vase and a ball touch the crate's other sides.
+    A book leans on a crate with a star on it; a mug, a vase and a ball touch the crate's other sides.
     """
     generator = np.random.default_rng([seed, 14])
     shell = Shell.of(seed)
     noise = Noise(generator)
     hue = float(generator.uniform())
-    boxes, mug, basket, vase, _ = make_groups(Stock(generator, noise, hue, spread=0.5))
-    crate = boxes.things[0]
-    ball = next(thing for thing in basket.things if thing.name == "ball")
+    groups = make_groups(Stock(generator, noise, hue, spread=0.5))
+    named = {thing.name: thing for group in groups for thing in group.things}
+    crate = named["crate"]
     x, y = crate.solid.vertices[:, :2].max(axis=0)
     turn = shell.turn @ turn_z(generator.uniform(0.0, 2.0 * np.pi))
-    middle = crate.position * [1.0, 1.0, 0.0]
     things: list[Thing[Mesh]] = []
     contacts: list[Contact] = []
-    add_group(things, contacts, boxes, turn, -turn @ middle)
-    # The mug's handle points away from the crate's west side, along which the others do not stand; so does the spoon.
-    for group, face, steps, along in (
-        (mug, 0.5 * np.pi, 0, generator.uniform(-0.05, 0.05)),
-        (vase, 0.0, generator.integers(SEGMENTS), generator.uniform(-0.07, 0.0)),
-        (_rolled(ball), np.pi, generator.integers(SEGMENTS), generator.uniform(-0.02, 0.06)),
+    add_group(things, contacts, groups[0], turn, -turn @ (crate.position * [1.0, 1.0, 0.0]))
+    # Each stands near an end of its side, so that photos show the other end, and the mug's handle points along it.
+    for name, face, gap, steps, along in (
+        ("mug", 0.5 * np.pi, x, 0, generator.uniform(-0.08, -0.02)),
+        ("vase", 0.0, y, generator.integers(SEGMENTS), generator.uniform(-0.12, -0.07)),
+        ("ball", np.pi, y, generator.integers(SEGMENTS), generator.uniform(-0.12, -0.06)),
     ):
-        way = turn_z(face)  # y is away from the crate
-        gap = x if face == 0.5 * np.pi else y
-        spin = turn_z(2.0 * np.pi * steps / SEGMENTS)
-        solid = group.things[0].solid
-        local = turned(solid.vertices, spin.T)
-        nearest = local[np.argmin(local[:, 1].round(9))]
+        spin, way = turn_z(2.0 * np.pi * steps / SEGMENTS), turn @ turn_z(face)  # y is away from the crate
+        corners = turned(named[name].solid.vertices, spin.T)
+        nearest = corners[np.argmin(corners[:, 1].round(9))]
         shift = np.array([along, gap - nearest[1], 0.0])
-        first = len(things) + 1
-        add_group(things, contacts, group, turn @ way @ spin, turn @ way @ shift)
-        lift = group.things[0].position + [0.0, 0.0, nearest[2]]
-        contacts.append(Contact(first, 1, turn @ way @ (shift + nearest * [1.0, 1.0, 0.0] + lift)))
+        alone = _standing(named[name])
+        add_group(things, contacts, alone, way @ spin, way @ shift)
+        contacts.append(Contact(len(things), 1, way @ (shift + nearest + alone.things[0].position)))
     return furnished(things, contacts, shell, generator, noise, hue)
 
 
-def _rolled(ball: Thing[Mesh]) -> Group:
-    """Return a ball that lies on the table."""
+def _standing(thing: Thing[Mesh]) -> Group:
+    """Return a thing alone, upright on the table."""
     group = Group()
-    radius = float(-ball.solid.vertices[:, 2].min())
-    group.place("ball", ball.solid, ball.texture, (0.0, 0.0, radius))
-    group.touch("ball", "table", 0.0, 0.0, 0.0)
+    group.place(thing.name, thing.solid, thing.texture, (0.0, 0.0, float(-thing.solid.vertices[:, 2].min())))
+    group.touch(thing.name, "table", 0.0, 0.0, 0.0)
     return group
 
 

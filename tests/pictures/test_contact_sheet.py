@@ -17,7 +17,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.records import EvalView, FullPhoto
 from beags_plugin.pictures.cells import GAP, write_picture
 from beags_plugin.pictures.contact_sheet import contact_sheet
-from beags_plugin.pictures.object_cells import COLUMNS, LARGEST, Drawing, object_cells, views_of
+from beags_plugin.pictures.object_cells import COLUMNS, LARGEST, Drawing, cell_size, object_shots, views_of
 from beags_plugin.pictures.orbit import least_shown, orbit, orbit_frame, orbit_settings, side, view_from
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.system.errors import UserError
@@ -70,6 +70,12 @@ def cells(picture: np.ndarray, size: int) -> list[list[np.ndarray]]:
     ]
 
 
+def object_cells(*words) -> np.ndarray:
+    """Return the cells of an object alone."""
+    shots = object_shots(*words)
+    return shots.cells(cell_size([shots]), words[-1])
+
+
 @pytest.mark.parametrize("masked", [True, False])
 def test_a_sheet_has_full_lines_and_no_empty_cell(tmp_path, masked):
     squares = [scene([each], grey=grey) for each in (CUP, BOX) for grey in (0.3, 0.6)]
@@ -107,6 +113,21 @@ def test_an_object_fills_two_lines_and_has_the_pixels_of_the_photos_files():
     photo = lines[0][0]
     inside = photo[(photo < 255).any(axis=(1, 2))]
     assert len(inside) > 150 and all(any(_colours(row) in each for each in rows) for row in inside)  # none resized
+
+
+def test_lines_of_objects_of_different_size_end_together():
+    sizes = (0.4, 0.7, 1.0)
+    objects = {
+        i: {"before": moved(ball(), 0.0, 0.0, 0.0, size=size), "after": moved(ball(0.2), 0.0, 0.0, 0.0, size=size)}
+        for i, size in enumerate(sizes, start=1)
+    }
+    shots = [object_shots(i, f"object {i}", stages, views(full=6), photos(), BALLS) for i, stages in objects.items()]
+    assert shots[0].pixels < shots[1].pixels < shots[2].pixels and cell_size(shots) == shots[1].pixels
+    sheet = contact_sheet(views(full=6), photos(), ball(), objects, {}, BALLS)
+    blocks = [each.cells(cell_size(shots), BALLS) for each in shots]
+    assert len({block.shape for block in blocks}) == 1
+    high, wide, _ = blocks[-1].shape
+    assert np.array_equal(sheet[-high - GAP : -GAP, :wide], blocks[-1])
 
 
 def _colours(row: np.ndarray) -> bytes:
