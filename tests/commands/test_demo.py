@@ -16,8 +16,10 @@ from beags_plugin.commands import demo, demo_training
 from beags_plugin.commands.cli import main
 from beags_plugin.commands.demo import check_preset
 from beags_plugin.commands.demo_training import STAMP, trained
-from beags_plugin.data.quick import quick_downscale
+from beags_plugin.data.quick import QUICK_PIXELS, quick_downscale
 from beags_plugin.plugin.options.config import base_config
+from beags_plugin.sample import writer
+from beags_plugin.sample.writer import SampleConfig
 from beags_plugin.system.errors import UserError
 
 
@@ -116,6 +118,25 @@ def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
     assert len(commands) == 3 and (run / "training.json").exists()
     assert again(downscale=2.0, fresh=True) == ("ns-train", 4)
     assert again(fresh=True) == ("ns-train", 5) and again() == ("ns-train", 5)
+
+
+def test_the_generated_scene_is_photos_of_a_desk_trained_on_with_close_ups(tmp_path, monkeypatch):
+    made, commands = [], []
+
+    def make_sample(folder, seed, width, height, degradation, views, **options):
+        made.append(SampleConfig(seed, width, height, views, degradation=degradation, **options))
+        write_scene(folder)
+
+    monkeypatch.setattr(writer, "make_sample", make_sample)
+    monkeypatch.setattr(demo_training, "finish", commands.append)
+    monkeypatch.setattr(demo, "measure", lambda *_: None)
+    demo.run_demo(None, tmp_path / "out", None, None, 4, False)
+    (config,), (command,) = made, commands
+    config.check()
+    assert (config.family, config.seed) == ("desk", 4) and config.width >= 640 and config.height >= 480
+    assert command[command.index("--pipeline.datamanager.focus") + 1] == "auto"
+    whole = config.width * config.height / float(command[command.index("--downscale-factor") + 1]) ** 2
+    assert 0.9 * QUICK_PIXELS < whole <= QUICK_PIXELS
 
 
 def test_photos_of_a_turntable_are_trained_on_again_by_their_objects(tmp_path, monkeypatch):

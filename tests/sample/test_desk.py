@@ -48,10 +48,9 @@ def test_baked_light_is_that_of_the_room(desk):
         hits, _ = first_hits(made, view.center, directions)
         points = view.center + hits.t[:, None] * directions
         baked = light.colours(points, hits.surface, directions, view.center)
-        four = [
-            np.repeat(each, 4, axis=0) for each in (points, hits.surface, directions)
-        ]  # each by its share of the lamp
-        expected = direct.colours(*four, view.center).reshape(-1, 4, 3).mean(axis=1)
+        # Each of four rays sees by its own share of the lamp.
+        place, part, way = (np.repeat(each, 4, axis=0) for each in (points, hits.surface, directions))
+        expected = direct.colours(place, part, way, view.center).reshape(-1, 4, 3).mean(axis=1)
         assert np.median(np.abs(baked - expected)) < 0.01 * np.median(expected)
         assert abs(baked.mean() / expected.mean() - 1.0) < 0.01
 
