@@ -16,7 +16,7 @@ from beags_plugin.sample.exposure import photo_gains
 from beags_plugin.sample.families import FAMILIES
 from beags_plugin.sample.points import find_tracks, seed_points
 from beags_plugin.sample.seen import Photo
-from beags_plugin.sample.shots import plan_shots
+from beags_plugin.sample.shots import AHEAD, plan_shots, taken
 from beags_plugin.sample.tracing import first_hits
 from beags_plugin.sample.views import pixel_directions, render_view
 from beags_plugin.sample.writer import SampleConfig, write_sample
@@ -25,7 +25,7 @@ from beags_plugin.system.errors import UserError
 TRAIN, TEST = [f"train{i}" for i in range(150)], [f"test{i}" for i in range(50)]
 
 
-@pytest.fixture(scope="module", params=("tabletop", "turntable", "room"))
+@pytest.fixture(scope="module", params=("tabletop", "turntable", "room", "desk"))
 def family(request):
     return request.param
 
@@ -176,7 +176,7 @@ def test_a_visitor_touches_no_object_and_no_camera(family, seed):
         places.append(parts[0].position)
         cameras = np.stack([view.center for view in views])
         assert min(np.abs(distance(part, cameras)).min() for part in parts) > 0.05
-        if family == "room":
+        if family in ("room", "desk"):
             low = visitors.AROUND_ROOM[0] - 0.175  # its radius at the table's height
             for thing in (*shot.still.things, shot.still.fixtures[0]):
                 vertices = thing.solid.vertices @ thing.rotation.T + thing.position
@@ -253,3 +253,15 @@ def test_differences_that_no_capture_has_are_refused(tmp_path, wrong, sentence):
     with pytest.raises(UserError, match=sentence):
         write_sample(tmp_path / "s", SampleConfig(**wrong))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("count", [1, AHEAD, AHEAD + 3])
+def test_pictures_rendered_beside_each_other_are_those_of_one_after_another(count):
+    made = FAMILIES["desk"]
+    shots = plan_shots(made, 0, made.views(0, 32, 24, count, 1)[:count], 0.0, 0.0, 0)
+    pictures = list(taken(shots, 2))
+    assert [shot for shot, _ in pictures] == shots
+    for shot, picture in pictures:
+        alone = render_view(shot.scene, shot.exposed, shot.view, 2)
+        for name in ("image", "labels", "depth", "silhouettes"):
+            assert np.array_equal(getattr(picture, name), getattr(alone, name))
