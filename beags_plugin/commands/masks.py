@@ -153,7 +153,7 @@ class Make:
     data: Path
     """Folder of the scene."""
     source: str
-    """id-images, object-images, coco, gaussian-grouping, langsplat, cut, grabcut, salient, sam2, or your own."""
+    """id-images, object-images, coco, gaussian-grouping, langsplat, cut, grabcut, salient, rembg, sam2, or your own."""
     options: tuple[str, ...] = ()
     """Of the source, as key=value, e.g. prompts=prompts.json."""
     load_config: Path | None = None

@@ -246,6 +246,7 @@ mistakes(
     "mask sources",
     {
         "SAM without its extra": without_extra("sam2"),
+        "rembg without the library": without_extra("rembg"),
         "salient without its extra": without_extra("salient"),
         "salient without weights": salient(None),
         "salient: weights that rembg knows but that are not there": salient(None, model="u2net"),

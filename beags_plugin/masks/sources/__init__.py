@@ -13,6 +13,7 @@ MASK_SOURCES = Registry(
         "id-images": "beags_plugin.masks.sources.id_images:IdImagesSource",
         "langsplat": "beags_plugin.masks.sources.langsplat:LangSplatSource",
         "object-images": "beags_plugin.masks.sources.object_images:ObjectImagesSource",
+        "rembg": "beags_plugin.masks.sources.rembg:RembgSource",
         "salient": "beags_plugin.masks.sources.salient:SalientSource",
         "sam2": "beags_plugin.masks.sources.sam2:Sam2Source",
     },

@@ -48,11 +48,21 @@ class SalientSource(MaskSource):
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         named = not self.model.endswith(".onnx")
         saliency = load(weights_folder() / f"{self.model}.onnx" if named else scene.below(Path(self.model)))
+        return one_object(scene, self.name, saliency, progress)
 
-        def labels(photo: Photo) -> np.ndarray | None:
-            return large_pieces(saliency(photo.pixels()) > 0.5).astype(np.uint16) if photo.trained else None
 
-        return MadeMasks({0: "background", 1: self.name}, per_photo(scene, progress, labels), [])
+def one_object(
+    scene: SourceScene, name: str, saliency: Callable[[np.ndarray], np.ndarray], progress: Progress
+) -> MadeMasks:
+    """Return masks of the training photos with what stands out in them as one object, without its small pieces.
+
+    saliency: from photos [H, W, 3] uint8 RGB to [H, W] in 0..1; above 1/2 lies the object.
+    """
+
+    def labels(photo: Photo) -> np.ndarray | None:
+        return large_pieces(saliency(photo.pixels()) > 0.5).astype(np.uint16) if photo.trained else None
+
+    return MadeMasks({0: "background", 1: name}, per_photo(scene, progress, labels), [])
 
 
 def load(path: Path) -> Callable[[np.ndarray], np.ndarray]:
