@@ -58,13 +58,17 @@ class Demo:
     With --fresh they are picked again, on the same base."""
     objects: int = 1
     """With --pick: how many objects to click on and name."""
+    mask_source: str | None = None
+    """What makes masks where there are none: salient, rembg, sam2, or your own (docs/masks.md); salient if left out."""
+    mask_options: tuple[str, ...] = ()
+    """Of the source, as key=value, e.g. model=isnet-general-use."""
 
     def run(self) -> None:
         with starting(self):
             from beags_plugin.commands.demo import run_demo
         run_demo(
             self.data, self.output, self.preset, self.downscale, self.seed, self.fresh, self.strict, self.pick,
-            self.objects,
+            self.objects, self.mask_source, self.mask_options,
         )  # fmt: skip
 
 

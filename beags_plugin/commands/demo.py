@@ -42,9 +42,11 @@ GENERATED = ("--pipeline.datamanager.focus", "auto", "--pipeline.datamanager.den
 
 def run_demo(
     data: Path | None, output: Path | None, preset: str | None, downscale: float | None, seed: int, fresh: bool,
-    strict: bool = False, pick: bool = False, objects: int = 1,
+    strict: bool = False, pick: bool = False, objects: int = 1, mask_source: str | None = None,
+    mask_options: tuple[str, ...] = (),
 ) -> None:  # fmt: skip
     """Run the whole demo in ``output`` and print the table; see ``cli.Demo`` for the arguments."""
+    from beags_plugin.commands.made_masks import SALIENT, ChosenSource
     from beags_plugin.commands.scene_setup import MadeScene, made_scene, name_of
     from beags_plugin.data.layout import read_dataset
     from beags_plugin.data.quick import quick_downscale
@@ -56,6 +58,9 @@ def run_demo(
     if downscale is not None and not 1.0 <= downscale < math.inf:
         raise UserError(f"downscale is {downscale}: give 1 (full size) or more.")
     _check_objects(data, pick, objects, strict)
+    chosen = ChosenSource(mask_source or SALIENT.name, mask_options)
+    if chosen != SALIENT and (pick or data is None):
+        raise UserError("no masks are made with --pick or of the sample, which has some: leave --mask-source out.")
     seconds: dict[str, float] = {}
     if data is None:
         output = output or Path("outputs/demo")
@@ -70,7 +75,7 @@ def run_demo(
         if pick:
             check_picked_before(output, fresh)
         with timed(seconds, "poses" if pick else "poses and masks"):
-            scene = made_scene(data, output, masks=not pick)
+            scene = made_scene(data, output, not pick, chosen.below(data))
         if strict:
             check_contradictions(scene, output)
         read_dataset(scene.data)  # reports what is missing before a training starts

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from beags_plugin.commands.made_masks import MADE, as_made, check_source, made_masks
+from beags_plugin.commands.made_masks import MADE, SALIENT, ChosenSource, as_made, check_source, made_masks
 from beags_plugin.commands.process import find_poses
 from beags_plugin.data.layout import fitting_layouts, read_dataset
 from beags_plugin.masks.sources.base import NothingFound
@@ -76,30 +76,34 @@ def object_name(data: Path) -> str:
     return name if name.isprintable() and name not in ("", "background") and not name.startswith("-") else "object"
 
 
-def made_scene(data: Path, output: Path, masks: bool = True) -> MadeScene:
+def made_scene(data: Path, output: Path, masks: bool = True, chosen: ChosenSource = SALIENT) -> MadeScene:
     """Return the scene in ``data``, or one made below ``output`` of photos without poses, or without masks.
 
     data: a scene, a folder of photos (or with images/, perhaps masks/), or a video. masks: whether they are needed.
-    What an earlier call made of the same photos is taken as it is; masks also where the user has mended them. Raises
-    ``UserError``; where masks cannot be made, before poses are computed.
+    chosen: the source of masks where there are none. What an earlier call made of the same photos is taken as it is;
+    masks also where the user has mended them. Raises ``UserError``; where masks cannot be made, before poses are
+    computed.
     """
     if data.is_dir() and (fitting_layouts(data) or any(any(data.glob(pattern)) for pattern in POSES)):
         read_dataset(data)  # says what lacks or is too much
         if not masks or _has_masks(data):
+            _check_needed(chosen, data, masks)
             return MadeScene(data)
-        check_source()
-        return MadeScene(data, made_masks(data, output / "made", object_name(data)))
+        check_source(chosen)
+        return MadeScene(data, made_masks(data, output / "made", object_name(data), chosen))
     found = [] if is_video(data) else find_photos(data)  # says what is wrong with them before anything is fetched
     given = data if any((data / "masks").rglob("*.png")) else None
     scene = output / "scene"
     _check_other(data, scene)
+    if given is not None:
+        _check_needed(chosen, data, masks)
     if not masks:
         CONSOLE.print(f"{data} has no poses, so they are computed from the photos.")
         _print_poses(data, scene)
         _write_origin(data, scene)
         return MadeScene(scene)
     if given is None:
-        check_source()
+        check_source(chosen)
     elif find_spec("pycolmap") is not None:  # else the next step says so
         with_masks(check_photos(found, scene / "images", progress_bar), given / "masks")
     CONSOLE.print(f"{data} has no poses, so they are computed from the photos.")
@@ -108,20 +112,20 @@ def made_scene(data: Path, output: Path, masks: bool = True) -> MadeScene:
         _print_poses(data, scene)
     except NothingFits as error:
         CONSOLE.print("The photos as a whole give no poses, so poses of the objects alone are tried.")
-        if (own := _scene_of_objects(scene, output / "turned", given, object_name(data), room=False)) is None:
+        if (own := _scene_of_objects(scene, output / "turned", given, object_name(data), chosen, room=False)) is None:
             raise error
     _write_origin(data, scene)
     if own is not None:
         return own
     if given is not None and (scene / MADE).exists():
         (scene / "classes.json").unlink(missing_ok=True)  # of masks that were made when none were given
-    labels = given or made_masks(scene, scene, object_name(data))
+    labels = given or made_masks(scene, scene, object_name(data), chosen)
     if objects_seem_turned(scene / MODEL, (labels or scene) / "masks"):
         CONSOLE.print(
             "The poses explain few of the objects' features, as if the objects had turned before a room that stands: "
             "poses of the objects alone are tried."
         )
-        own = _scene_of_objects(scene, output / "turned", given, object_name(data), room=True)
+        own = _scene_of_objects(scene, output / "turned", given, object_name(data), chosen, room=True)
     return own or MadeScene(scene, labels)
 
 
@@ -130,7 +134,9 @@ def _print_poses(data: Path, scene: Path, masks: Path | None = None) -> None:
         CONSOLE.print(line)
 
 
-def _scene_of_objects(scene: Path, folder: Path, given: Path | None, name: str, room: bool) -> MadeScene | None:
+def _scene_of_objects(
+    scene: Path, folder: Path, given: Path | None, name: str, chosen: ChosenSource, room: bool
+) -> MadeScene | None:
     """Make a scene in ``folder`` with poses from the objects' features alone.
 
     scene: with the photos. given: the folder that holds the user's masks/. name: of the object. room: whether ``scene``
@@ -140,7 +146,7 @@ def _scene_of_objects(scene: Path, folder: Path, given: Path | None, name: str, 
     labels, photos = given or folder / "labels", scene / "images"
     try:
         if given is None:
-            _all_masks(photos, labels, name, scene / "masks" if room else None)
+            _all_masks(photos, labels, name, chosen, scene / "masks" if room else None)
         _print_poses(photos, folder, labels / "masks")
     except (NothingFits, NothingFound) as error:
         CONSOLE.print(f"There are no poses of the objects alone: {error}")
@@ -158,9 +164,9 @@ def _scene_of_objects(scene: Path, folder: Path, given: Path | None, name: str, 
     return MadeScene(folder, labels, turned=True)
 
 
-def _all_masks(photos: Path, labels: Path, name: str, mended: Path | None) -> None:
+def _all_masks(photos: Path, labels: Path, name: str, chosen: ChosenSource, mended: Path | None) -> None:
     """Make masks of all photos, of held-out ones too, as their poses need them; those in ``mended`` go before."""
-    made_masks(photos, labels, name)
+    made_masks(photos, labels, name, chosen)
     for mask in sorted(mended.glob("*.png")) if mended is not None else ():
         same = labels / "masks" / mask.name
         if not same.exists() or same.read_bytes() != mask.read_bytes():
@@ -180,6 +186,14 @@ def _check_other(data: Path, scene: Path) -> None:
         return
     if former != str(data.resolve()):
         raise UserError(f"{scene} was made of {former}: give another --output for {data}.")
+
+
+def _check_needed(chosen: ChosenSource, data: Path, masks: bool) -> None:
+    """Raise ``UserError`` where a source of masks is asked for, although data has some."""
+    if masks and chosen != SALIENT:
+        raise UserError(
+            f"{data} has masks already: leave --mask-source out, or replace them by {chosen.command(data)} --overwrite."
+        )
 
 
 def _has_masks(data: Path) -> bool:

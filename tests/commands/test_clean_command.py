@@ -17,6 +17,7 @@ pytest.importorskip("nerfstudio")
 
 import beags_plugin.commands.scene_setup as made_scenes
 from beags_plugin.commands.cli import main
+from beags_plugin.commands.made_masks import SALIENT
 from beags_plugin.importers.base import read_scene
 from beags_plugin.objects.written_back import changes, format_of
 from beags_plugin.surfaces.closing_surfels import joined
@@ -67,12 +68,12 @@ def test_masks_are_made_where_there_are_none_and_gaussians_with_volume_are_polis
     (tmp_path / "made").mkdir()
     (tmp_path / "data/masks").rename(tmp_path / "made/masks")
     asked = []
-    monkeypatch.setattr(made_scenes, "check_source", lambda: None)
+    monkeypatch.setattr(made_scenes, "check_source", lambda chosen: None)
     monkeypatch.setattr(made_scenes, "made_masks", lambda *where: asked.append(where) or tmp_path / "made")
     write(tmp_path / "scene.ply", "ply", scene.surfels)
     main(["clean", "scene.ply", "--data", "data", "--output", "out", "--polish", "2", "--steps", "2"])
     report = json.loads(Path("out/clean.json").read_text())
-    assert asked == [(Path("data"), Path("out/made"), "data")] and report["polish"] == 2
+    assert asked == [(Path("data"), Path("out/made"), "data", SALIENT)] and report["polish"] == 2
     assert report["start"]["flattening"]["median_ratio"] == pytest.approx(1e-3, rel=1e-3)
     assert report["metrics"]["psnr"]["before"] > 30  # The polish comes first.
     assert read_scene(Path("out/scene.cleaned.ply")).kind == "3DGS .ply"

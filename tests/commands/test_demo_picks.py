@@ -126,7 +126,7 @@ def test_masks_that_were_mended_after_picking_stay(stand, capsys):
 
 def test_the_base_of_a_demo_without_picks_is_used_again_and_its_run_is_replaced_only_if_asked_for(stand, monkeypatch):
     monkeypatch.setattr("beags_plugin.masks.sources.salient.load", lambda _: lambda photo: photo[..., 0] > -1)
-    monkeypatch.setattr("beags_plugin.commands.scene_setup.check_source", lambda: None)
+    monkeypatch.setattr("beags_plugin.commands.scene_setup.check_source", lambda chosen: None)
     assert stand.run(pick=False) == ["both", "measured"]
     kept = (stand.output / "run/base/config.yml").read_text()
     with pytest.raises(UserError, match=r"out/run holds a run that was trained without --pick: add --fresh"):

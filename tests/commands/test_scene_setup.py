@@ -155,6 +155,43 @@ def test_masks_are_made_anew_for_other_photos_unless_they_were_mended(posed, tmp
     assert "so they stay" in capsys.readouterr().out
 
 
+def test_another_source_of_masks_is_asked_and_its_change_makes_them_anew(posed, tmp_path, trainings, monkeypatch):
+    asked = []
+    monkeypatch.setattr("beags_plugin.masks.sources.rembg.find_spec", lambda name: object())
+    found = {"isnet-general-use": 90, "birefnet-general": 180}
+    monkeypatch.setattr(
+        "beags_plugin.masks.sources.rembg.load",
+        lambda model: asked.append(model) or (lambda photo: photo[..., 0] > found[model]),
+    )
+
+    def run(*options: str) -> set[str]:
+        demo.run_demo(posed, tmp_path / "out", "beags-tiny", None, 0, True, mask_source="rembg", mask_options=options)
+        return {label for label in (tmp_path / "out/made/classes.json").read_text().split('"') if label.isalpha()}
+
+    assert run("name=cup") == {"background", "cup"} and asked == ["isnet-general-use"]
+    shutil.rmtree(tmp_path / "out/run")
+    run("name=cup")
+    assert asked == ["isnet-general-use"], "they are as they were made"
+    shutil.rmtree(tmp_path / "out/run")
+    assert run("model=birefnet-general") == {"background", "data"} and asked[1:] == ["birefnet-general"]
+
+
+def test_a_source_that_does_not_fit_is_refused(posed, tmp_path):
+    def run(source: str, data: Path | None = posed, **options) -> None:
+        demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, False, mask_source=source, **options)
+
+    with pytest.raises(UserError, match="cannot ask the mask source cut, which needs a trained run or masks made else"):
+        run("cut")
+    with pytest.raises(UserError, match="there is no mask source 'rembgs'"):
+        run("rembgs")
+    with pytest.raises(UserError, match="leave --mask-source out"):
+        run("rembg", None)
+    write_image(posed / "masks/v01.png", np.ones((60, 100), np.uint8))
+    with pytest.raises(UserError, match=r"has masks already: .* --source rembg --options model=u2netp --overwrite\."):
+        run("rembg", mask_options=("model=u2netp",))
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_network_that_finds_nothing_is_a_user_error(posed, tmp_path):
     for photo in (posed / "images").iterdir():
         write_image(photo, np.full((60, 100, 3), 90, np.uint8))
