@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+import shutil
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
+from beags_plugin.masks.separate_things import Things
 from beags_plugin.system.pasted import quoted
 
 SURE, FAIR = 0.9, 0.75  # From such an agreement between views on, the demo is sure, and fairly sure.
@@ -33,15 +35,25 @@ class Certainty:
         return {"level": self.level, "sentences": self.lines, **self.figures}
 
 
-def certainty(run: Path, scene: Path, masks: Path | None = None, again: str = "beags demo --pick") -> Certainty:
-    """Judge a finished demo. run: its run. scene: its photos' folder, with poses.json if poses were made. masks: the
-    folder of masks that were made, from which some may be deleted. again: the command that has the objects picked."""
+def certainty(
+    run: Path, scene: Path, masks: Path | None = None, again: str = "beags demo --pick", apart: Path | None = None
+) -> Certainty:
+    """Judge a finished demo.
+
+    run: its run. scene: its photos' folder, with poses.json if poses were made. masks: the folder of masks that were
+    made, from which some may be deleted. again: the command that has the objects picked. apart: the folder in which
+    things were told apart, with what the masks agree on.
+    """
     lines, figures = [], {}
-    agreement = _json(run / "prepared/report.json").get("agreement")
+    agreement = _json(apart / "report.json") if apart else _json(run / "prepared/report.json").get("agreement")
     level = "not judged" if agreement is None else _level(agreement)
     if agreement is not None:
         figures["agreement"] = {name: agreement[name] for name in ("agreement", "masks", "overruled", "doubtful")}
         lines.append(_of_masks(level, agreement))
+    things = None if agreement is None or "things" not in agreement else Things(**agreement["things"])
+    if things is not None:
+        figures["things"] = asdict(things)
+        lines += [things.sentence()] if things.sentence() else []
     poses = _json(scene / "poses.json")
     if {"photos", "registered"} <= set(poses):
         without = int(poses["photos"]) - int(poses["registered"])
@@ -52,7 +64,7 @@ def certainty(run: Path, scene: Path, masks: Path | None = None, again: str = "b
         figures["object pixels"] = list(size)
         finer = ": for more detail, add --downscale 1" if max(size) < SMALL else ""
         lines.append(f"The object has about {size[0]} x {size[1]} pixels in the photos as they were trained on{finer}.")
-    if agreement is not None and level != "sure":
+    if agreement is not None and (level != "sure" or (things is not None and things.found < things.asked)):
         lines += _next(again, agreement, masks)
     return Certainty(level, lines, figures)
 
@@ -95,8 +107,14 @@ def _size(masks: Path) -> tuple[int, int] | None:
     return None if not boxes else tuple(int(side) for side in np.median(boxes, axis=0))  # pyright: ignore[reportReturnType]
 
 
-def write_doubt(run: Path, path: Path) -> bool:
-    """Write a picture of the views whose masks changed most; return whether there is one, else remove an old one."""
+def write_doubt(run: Path, path: Path, apart: Path | None = None) -> bool:
+    """Write a picture of the views whose masks changed most; return whether there is one, else remove an old one.
+
+    apart: the folder in which things were told apart, with such a picture.
+    """
+    if apart is not None and (apart / path.name).exists():
+        shutil.copyfile(apart / path.name, path)
+        return True
     from beags_plugin.pictures.masks import Changed, before_and_after
     from beags_plugin.runs.prepared import training_masks
     from beags_plugin.runs.relocation import open_run

@@ -57,7 +57,7 @@ class Demo:
     """Click on the objects in the viewer, which opens when the base is trained; the demo goes on once they are saved.
     With --fresh they are picked again, on the same base."""
     objects: int = 1
-    """With --pick: how many objects to click on and name."""
+    """How many things that stand out to tell apart, where they do not touch; with --pick, to click on and name."""
     mask_source: str | None = None
     """What makes masks where there are none: salient, rembg, sam2, or your own (docs/masks.md); salient if left out."""
     mask_options: tuple[str, ...] = ()

@@ -5,17 +5,21 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from rich.console import Console
 
 from beags_plugin.commands.demo_picks import (
-    check_picked_before,
+    APART,
+    check_one_object,
+    check_trained_otherwise,
     names_of,
     picked_scene,
+    things_apart,
     trained_base,
     with_made_masks,
 )
@@ -72,10 +76,12 @@ def run_demo(
         output = output or Path("outputs") / name_of(data)
         if output.resolve() == data.resolve():
             raise UserError(f"{output} is the data: give another --output.")
-        if pick:
-            check_picked_before(output, fresh)
+        how = {"pick": True} if pick else {"objects": objects} if objects > 1 else {}
+        check_trained_otherwise(output, fresh, how)
         with timed(seconds, "poses" if pick else "poses and masks"):
             scene = made_scene(data, output, not pick, chosen.below(data))
+        if objects > 1 and not pick:
+            check_one_object(scene, data)
         if strict:
             check_contradictions(scene, output)
         read_dataset(scene.data)  # reports what is missing before a training starts
@@ -83,8 +89,19 @@ def run_demo(
     request = {"preset": preset, "downscale": downscale}
     if pick:
         assert data is not None
-        scene = _trained_by_picks(scene, output, request, names_of(data, objects), fresh, again, seconds)
+        names = names_of(data, objects)
+        scene = _trained_on_base(
+            scene, output, request, fresh, seconds, {"pick": True},
+            lambda base: picked_scene(scene, output, base, names, fresh, again),
+        )  # fmt: skip
+    elif objects > 1 and not scene.turned:
+        scene = _trained_on_base(
+            scene, output, request, fresh, seconds, {"objects": objects},
+            lambda base: things_apart(scene, output, base, objects),
+        )  # fmt: skip
     else:
+        if objects > 1:
+            CONSOLE.print("As they turned before a room that stands, the things stay one object.")
         _trained_by_masks(scene, output, request, fresh, GENERATED if data is None else ())
     measure(output / "run", output, seconds, scene, again)
     if pick:
@@ -109,24 +126,27 @@ def _trained_by_masks(
         train_once(scene, output, alone, fresh, replace=True, words=words)
 
 
-def _trained_by_picks(
-    scene: MadeScene, output: Path, request: dict[str, Any], names: Sequence[str], fresh: bool, again: str,
-    seconds: dict[str, float],
+def _trained_on_base(
+    scene: MadeScene, output: Path, request: dict[str, Any], fresh: bool, seconds: dict[str, float],
+    how: dict[str, Any], with_masks: Callable[[Path], MadeScene],
 ) -> MadeScene:  # fmt: skip
-    """Train the base of a scene, have objects picked on it, and refine with them; return the scene with their masks."""
+    """Train the base of a scene, and refine it with masks made on it; return the scene with these masks.
+
+    how: what tells the run from one that was trained in one go. with_masks: from the base's run to the scene.
+    """
     from beags_plugin.runs.prepared import photos_contradict
 
     kept = inputs_digest(with_made_masks(scene, output), output, request["preset"])
-    base = trained_base(scene, output, request, {**request, "inputs": kept}, fresh)
+    base = trained_base(replace(scene, labels=None), output, request, {**request, "inputs": kept}, fresh)
     seconds["base training"] = json.loads((base / "training.json").read_text())["seconds"].get("base training", 0.0)
-    scene = picked_scene(scene, output, base, names, fresh, again)
-    request = {**request, "inputs": inputs_digest(scene, output, request["preset"]), "pick": True}
+    scene = with_masks(base)
+    request = {**request, "inputs": inputs_digest(scene, output, request["preset"]), **how}
     words = ("--load-dir", str((base / "nerfstudio_models").absolute()), "--pipeline.model.base-steps", "0")
     train_once(scene, output, request, fresh, words=words)
     if photos_contradict(output / "run"):
         CONSOLE.print(
-            "The photos contradict each other outside the masks, as on a turntable: without --pick, poses and training "
-            "are of the objects alone."
+            "The photos contradict each other outside the masks, as on a turntable: poses and training are of the "
+            "objects alone without --pick and --objects."
         )
     return scene
 
@@ -139,11 +159,8 @@ def _check_objects(data: Path | None, pick: bool, objects: int, strict: bool) ->
         raise UserError("there is nothing to pick, as the sample has masks: name photos with --data.")
     if pick and strict:
         raise UserError("with --pick there are no masks of a network that could contradict: leave --strict out.")
-    if objects > 1 and not pick:
-        raise UserError(
-            "the network marks what stands out in a photo as one object, and cannot tell several apart: add --pick, "
-            f"and click on each of the {objects}."
-        )
+    if objects > 1 and data is None:
+        raise UserError("the sample has masks of its objects: name photos with --data, or leave --objects out.")
 
 
 def _again(data: Path | None, output: Path | None, preset: str | None, downscale: float | None, objects: int) -> str:
@@ -222,10 +239,11 @@ def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene
     made = {name: seconds.pop(name) for name in BEFORE if name in seconds}
     stages = {**made, **{name: taken for name, taken in training["seconds"].items() if name not in made}, **seconds}
     memory = training["peak_memory_mb"]
-    sure = certainty(run, scene.data, scene.made_masks, again)
+    apart = scene.labels if scene.labels == output / APART else None
+    sure = certainty(run, scene.data, scene.made_masks, again, apart)
     summary = {**summary_json(metrics, stages, memory), "certainty": sure.to_json()}
     write_text_atomically(json.dumps(summary, indent=2), output / "summary.json")
-    doubt = write_doubt(run, output / "doubt.png")
+    doubt = write_doubt(run, output / "doubt.png", apart)
     CONSOLE.print(render_run(metrics, stages, memory))
     CONSOLE.print(f"objects: {', '.join(str(item.ply) for item in extracted)}")
     CONSOLE.print(f"figures: {output / 'summary.json'}")

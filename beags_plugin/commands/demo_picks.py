@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
@@ -12,15 +13,26 @@ from typing import Any
 
 from rich.console import Console
 
-from beags_plugin.commands.demo_training import STARTED, quiet_environment, read_stamp, train_once, trained, write_stamp
+from beags_plugin.commands.demo_training import (
+    STARTED,
+    difference,
+    quiet_environment,
+    read_stamp,
+    train_once,
+    trained,
+    write_stamp,
+)
 from beags_plugin.commands.made_masks import MADE
 from beags_plugin.commands.scene_setup import MadeScene, object_name
 from beags_plugin.data.files import OWN_PICTURES
 from beags_plugin.system.child_processes import bound
 from beags_plugin.system.digests import folder_digest, value_digest
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.whole_files import write_text_atomically
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
+APART_STAMP = "apart.json"  # in it: what the masks were made of, and what they were then
+APART = "apart"  # in the output: masks/, classes.json, report.json and doubt.png of things that lie apart
 FOLDER = "pick"  # in the output: run/, the base; masks/ and classes.json, what was picked
 OF_MASKS = ("masks", "masks_to_look_at", "classes.json", MADE, *OWN_PICTURES)  # of a scene: nothing of its base
 
@@ -31,13 +43,25 @@ def names_of(data: Path, objects: int) -> tuple[str, ...]:
     return (name,) if objects == 1 else tuple(f"{name} {number}" for number in range(1, objects + 1))
 
 
-def check_picked_before(output: Path, fresh: bool) -> None:
-    """Raise ``UserError`` where another demo, without picks, would be replaced: before anything is trained."""
+def check_trained_otherwise(output: Path, fresh: bool, how: dict[str, Any]) -> None:
+    """Raise ``UserError`` where a demo without masks made on its base would be replaced: before anything is trained."""
     run, stamp = output / "run", read_stamp(output)
-    if not fresh and (run / "training.json").exists() and not stamp.get(STARTED, stamp).get("pick"):
+    former = stamp.get(STARTED, stamp)
+    if not fresh and (run / "training.json").exists() and {name: former.get(name) for name in how} != how:
         raise UserError(
-            f"{run} holds a run that was trained without --pick: add --fresh to replace it (its base is used again), "
-            "or choose another --output."
+            f"{run} holds a run that was trained {difference(stamp, {**former, **how})}: add --fresh to replace it "
+            "(its base is used again), or choose another --output."
+        )
+
+
+def check_one_object(scene: MadeScene, data: Path) -> None:
+    """Raise ``UserError`` where masks are not of one object that things can be told apart in."""
+    folder = scene.labels or scene.data
+    names = json.loads((folder / "classes.json").read_text()) if (folder / MADE).exists() else {}
+    if len(set(names) - {"0"}) != 1:
+        raise UserError(
+            f"the masks of {data} are not a network's that marks one object, so there are no things to tell apart in "
+            "it: leave --objects out, or add --pick."
         )
 
 
@@ -87,6 +111,30 @@ def picked_scene(
         _open_viewer(base, folder, names, again)
         if _changed_at(folder / STAMP) == before:
             raise UserError(f"nothing was saved in the viewer, so there is no object yet. {_go_on(again)}")
+    return replace(scene, labels=folder)
+
+
+def things_apart(scene: MadeScene, output: Path, base: Path, objects: int) -> MadeScene:
+    """Return the scene with masks of so many things that lie apart in the base, or of fewer; made anew unless they were
+    before, of the same masks and base, or somebody has mended them.
+    """
+    from beags_plugin.objects.agree_masks import agree_masks
+    from beags_plugin.objects.reproject_masks import ReprojectionOptions
+
+    folder, given = output / APART, scene.labels or scene.data
+    masks, stamp = folder / "masks", folder / APART_STAMP
+    made_of = value_digest([folder_digest(given / "masks"), _changed_at(base / "training.json"), objects])
+    former = json.loads(stamp.read_text()) if stamp.exists() else {}
+    if former.get("of") == made_of and any(masks.rglob("*.png")):
+        CONSOLE.print(f"Told apart before: {masks}.")
+    elif former and former.get("masks") != folder_digest(masks):
+        CONSOLE.print(f"The masks in {masks} are not as they were made, so they stay: delete {folder} for new ones.")
+    else:
+        shutil.rmtree(folder, ignore_errors=True)
+        options = ReprojectionOptions(given / "masks", given / "classes.json", run_size=True)
+        for line in agree_masks(base / "config.yml", options, folder, objects, enlarge=True):
+            CONSOLE.print(line)
+        write_text_atomically(json.dumps({"of": made_of, "masks": folder_digest(masks)}), stamp)
     return replace(scene, labels=folder)
 
 

@@ -49,7 +49,7 @@ def train_once(
     else:
         if (run / "training.json").exists() and not (fresh or replace):
             raise UserError(
-                f"{run} holds a run that was trained {_difference(read_stamp(output), request)}: add --fresh to "
+                f"{run} holds a run that was trained {difference(read_stamp(output), request)}: add --fresh to "
                 "replace it, or choose another --output."
             )
         shutil.rmtree(run, ignore_errors=True)
@@ -78,11 +78,13 @@ def trained(output: Path, request: dict[str, Any]) -> bool:
     return request in (former, former.get(STARTED)) and (output / "run" / "training.json").exists()
 
 
-def _difference(stamp: dict[str, Any], request: dict[str, Any]) -> str:
+def difference(stamp: dict[str, Any], request: dict[str, Any]) -> str:
     """Return in which way an earlier request, as its stamp holds it, differs from ``request``."""
     former = stamp.get(STARTED, stamp)
     if bool(former.get("pick")) != bool(request.get("pick")):
         return "with --pick" if former.get("pick") else "without --pick"
+    if former.get("objects") != request.get("objects"):
+        return f"with --objects {former['objects']}" if "objects" in former else "without --objects"
     for name, flag in (("preset", "--preset"), ("downscale", "--downscale")):
         if former.get(name) != request.get(name):
             return f"with {flag} {former.get(name)}"

@@ -47,14 +47,14 @@ class ChosenSource:
                 "make masks by beags masks make first, then run the demo on that scene."
             )
         nameless = called and hasattr(source, "name") and not any(each.startswith("name=") for each in self.options)
-        return replace(source, name=called) if nameless else source  # pyright: ignore[reportCallIssue]
+        return replace(source, name=called) if nameless else source  # pyright: ignore[reportArgumentType]
 
     def digest(self) -> str:
         """Digest the options, and the content of files that they name; empty for those that are the default."""
         if self == SALIENT:
             return ""
         source = self.source()
-        values = [getattr(source, field.name) for field in fields(source)]
+        values = [getattr(source, field.name) for field in fields(source)]  # pyright: ignore[reportArgumentType]
         files = [value for value in values if isinstance(value, Path) and value.is_file()]
         return value_digest([self.name, *(str(value) for value in values), content_digest(files)])
 

@@ -130,6 +130,8 @@ class Agree:
     """Folder of the id images, if not those that the run was trained on."""
     classes_path: Path | None = None
     """File {"id": "name"} for them; classes.json beside the folder if there is one."""
+    objects: int = 1
+    """Split the one object of the masks into so many things, where they lie apart in space."""
     run_size: bool = False
     """Work at the size that was trained on instead of that of the photographs: quicker, smaller masks."""
     data: Path | None = None
@@ -138,11 +140,13 @@ class Agree:
     """Folder for masks, classes.json, report.json and doubt.png; agreed/ beside config.yml."""
 
     def run(self) -> None:
+        if self.objects < 1:
+            raise UserError(f"objects is {self.objects}: give 1 or more.")
         with starting(self):
             from beags_plugin.objects.agree_masks import agree_masks
             from beags_plugin.objects.reproject_masks import ReprojectionOptions
         options = ReprojectionOptions(self.masks_path, self.classes_path, run_size=self.run_size, data=self.data)
-        for line in agree_masks(self.load_config, options, self.output):
+        for line in agree_masks(self.load_config, options, self.output, self.objects):
             CONSOLE.print(line)
 
 

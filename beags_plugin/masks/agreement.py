@@ -48,13 +48,15 @@ class Agreement:
     """The decisions on N Gaussians by the masks of V views.
 
     class_ids: [N] int32. sure: [N] bool, where the votes say clearly what the cut says. errors: [V] float64, e_v; NaN
-    without a mask. say: [V] float64, a_v; 0 for a view that has lost its say or shows no object.
+    without a mask. say: [V] float64, a_v; 0 for a view that has lost its say or shows no object. light: [N] float64, of
+    all classes, by the say of the views.
     """
 
     class_ids: Tensor
     sure: Tensor
     errors: np.ndarray
     say: np.ndarray
+    light: np.ndarray
 
     @property
     def contradicted(self) -> list[int]:
@@ -106,7 +108,7 @@ def decide(
     class_ids = np.where(claims.any(axis=1), np.where(claims, share[:, 1:], -1.0).argmax(axis=1) + 1, BACKGROUND)
     own = np.take_along_axis(sums, class_ids[:, None], axis=1)[:, 0]
     sure = own / np.maximum(total + 1.0, 1.0) > 0.5 + SURE
-    return Agreement(torch.from_numpy(class_ids.astype(np.int32)), torch.from_numpy(sure), errors, say)
+    return Agreement(torch.from_numpy(class_ids.astype(np.int32)), torch.from_numpy(sure), errors, say, total)
 
 
 def _claimed(graph: SurfaceGraph, of_object: np.ndarray, total: np.ndarray) -> np.ndarray:

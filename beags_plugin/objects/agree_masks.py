@@ -8,9 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import cast
 
+import cv2
 import numpy as np
 import torch
 
+from beags_plugin.data.files import image_size
 from beags_plugin.labels.classes import write_mask
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks.agreement import AgreedMask
@@ -21,7 +23,7 @@ from beags_plugin.preparation.agreed import agree
 from beags_plugin.preparation.pipeline import check_masks, known_classes
 from beags_plugin.runs.read import SavedScene
 from beags_plugin.runs.run import Run
-from beags_plugin.system.errors import writing
+from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import counted, progress_bar
 from beags_plugin.views.data_options import DataOptions
 
@@ -31,12 +33,16 @@ IN_DOUBT, CHANGED, AS_GIVEN = 0, 128, 255  # grey values in its last column
 LEGEND = "black: in doubt, grey: changed"
 
 
-def agree_masks(config_path: Path, options: ReprojectionOptions, output: Path | None = None) -> list[str]:
+def agree_masks(
+    config_path: Path, options: ReprojectionOptions, output: Path | None = None, things: int = 1, enlarge: bool = False
+) -> list[str]:
     """Write masks of all training views that agree, classes.json, report.json and doubt.png; return lines for users.
 
     config_path: config.yml of any run, trained with or without masks. options: of the data; those of reprojection are
-    not used. output: the folder; ``agreed`` beside config.yml if None. Raises ``UserError`` for a run or data that
-    cannot be used, and if no mask of a training view names an object.
+    not used. output: the folder; ``agreed`` beside config.yml if None. things: above 1, the one object of the masks is
+    split into so many separate things, or fewer, which are called as it is, and numbered. enlarge: masks made at the
+    run's size are written at that of the photos. Raises ``UserError`` for a run or data that cannot be used, and if no
+    mask of a training view names an object.
     """
     run = Run(config_path, options.data)
     scene, manager = run.scene, data_to_reproject(run, options)
@@ -45,6 +51,11 @@ def agree_masks(config_path: Path, options: ReprojectionOptions, output: Path | 
         given = LabelMaps(view.labels for view in counted(views, len(views), progress))
     check_masks(given)
     classes = manager.train_dataset.metadata["classes"]
+    if things > 1 and len(classes) != 2:
+        raise UserError(
+            f"the masks name {len(classes) - 1} objects ({', '.join(classes[i] for i in classes if i)}), and only one "
+            "can be split into things that lie apart: leave --objects out."
+        )
     shown = CompressedMaps()
 
     def pixels(view: int) -> np.ndarray:
@@ -58,13 +69,20 @@ def agree_masks(config_path: Path, options: ReprojectionOptions, output: Path | 
         scene.surfels().detach(), [view.camera for view in views], given, known_classes(given, classes),
         run.rasterizer, run.settings, progress_bar,
         1 if options.run_size else max(1, round(_downscale(scene))),
-        [partial(pixels, view) for view in range(len(views))], take,
+        [partial(pixels, view) for view in range(len(views))], take, things,
     )  # fmt: skip
+    if report.things is not None:
+        called = next(name for class_id, name in classes.items() if class_id)
+        classes = {0: classes[0], **{i: f"{called} {i}" for i in range(1, report.things.found + 1)}}
     names, output = [view.name for view in views], output or config_path.parent / FOLDER
     with writing(output):
         for index, path in enumerate(mask_paths(manager.train_dataset.image_filenames)):
             (output / "masks" / path).parent.mkdir(parents=True, exist_ok=True)
-            write_mask(output / "masks" / path, files.as_in_file(labels[index].numpy().astype(np.uint16), index))
+            mask = files.as_in_file(labels[index].numpy().astype(np.uint16), index)
+            if enlarge:
+                size = image_size(manager.train_dataset.image_filenames[index])
+                mask = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST_EXACT)
+            write_mask(output / "masks" / path, mask)
         (output / "classes.json").write_text(json.dumps({str(i): name for i, name in classes.items()}, indent=1))
         (output / "report.json").write_text(json.dumps(report.to_json(names), indent=1))
         touched = np.add(report.changed, report.doubtful)
@@ -79,7 +97,9 @@ def agree_masks(config_path: Path, options: ReprojectionOptions, output: Path | 
             before_and_after(output / "doubt.png", pictured, LEGEND)
     written = ("masks", "report.json", *(["doubt.png"] if pictured else []))
     said = [f"{report.sentence(names)}.", *(str(output / name) for name in written)]
-    if options.run_size and _downscale(scene) != 1.0:
+    if report.things is not None and (sentence := report.things.sentence()):
+        said.insert(1, sentence)
+    if options.run_size and not enlarge and _downscale(scene) != 1.0:
         return [*said, "These masks are smaller than the photos: to train with masks, make them without --run-size."]
     return [*said, f"Next: {_refinement(scene, output.absolute())}"]
 

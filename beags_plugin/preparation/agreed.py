@@ -1,18 +1,20 @@
-"""Masks of all views that agree in space (``picking.agreement``), and figures on what that changed."""
+"""Masks of all views that agree in space (``masks.agreement``), and figures on what that changed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import torch
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.masks.agreement import AgreedMask, agreed_masks, decide
+from beags_plugin.masks.separate_things import Things, separate, separated_labels
 from beags_plugin.preparation.consistent_masks import Stage, translated
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 
@@ -25,13 +27,14 @@ class AgreementReport:
 
     errors: [V], share of what a view or the others call objects on which it contradicts them; None without a mask.
     overruled: views whose masks are not believed at all, or show nothing. changed, doubtful: [V], shares of pixels with
-    another class than given, and left unlabelled.
+    another class than given, and left unlabelled. things: that an object was split into; None where it was not.
     """
 
     errors: list[float | None]
     overruled: list[int]
     changed: list[float]
     doubtful: list[float]
+    things: Things | None = None
 
     @property
     def agreement(self) -> float:
@@ -43,6 +46,7 @@ class AgreementReport:
         """Return plain values; names: of the views."""
         rows = zip(names, self.errors, self.changed, self.doubtful, strict=True)
         return {
+            **({} if self.things is None else {"things": asdict(self.things)}),
             "agreement": round(self.agreement, 4),
             "masks": sum(error is not None for error in self.errors),
             "overruled": [names[view] for view in self.overruled],
@@ -79,15 +83,22 @@ def agree(
     reach: int = 1,
     photos: Sequence[Callable[[], np.ndarray]] | None = None,
     take: Callable[[int, AgreedMask], None] = lambda view, mask: None,
+    things: int = 1,
 ) -> tuple[LabelMaps, AgreementReport]:
     """Return the labels of V views, class ids, as one decision per Gaussian has them, and what that changed.
 
-    known: the classes. take: receives the number of each view and its mask, in ranks of ``known``. Other arguments as
-    of ``picking.agreement``.
+    known: the classes. take: receives the number of each view and its mask, in ranks of ``known``. things: above 1, the
+    one object is split into at most so many separate things, whose ids are 1, 2, ... Other arguments as of
+    ``masks.agreement``.
     """
     given = translated(maps, known, known.ranks)
     with stage("Weighing masks") as progress:
         found = decide(surfels, cameras, given, rasterizer, settings, len(known), progress)
+    split = None
+    if things > 1:
+        split = separate(found, surfels, things)
+        given = LabelMaps(separated_labels(split, surfels, cameras, given, rasterizer, settings))
+        found, known = split.agreement, ClassRanks(torch.arange(split.things.found + 1))
     ranked, changed, doubtful = LabelMaps(), [], []
     with stage("Drawing agreed masks") as progress:
         masks = agreed_masks(found, surfels, cameras, given, rasterizer, settings, len(known), reach, photos)
@@ -99,4 +110,6 @@ def agree(
             if progress is not None:
                 progress(view + 1, len(cameras))
     errors = [None if np.isnan(error) else round(float(error), 4) for error in found.errors]
-    return translated(ranked, known, known.class_ids), AgreementReport(errors, found.silenced, changed, doubtful)
+    things_found = None if split is None else split.things
+    report = AgreementReport(errors, found.silenced, changed, doubtful, things_found)
+    return translated(ranked, known, known.class_ids), report

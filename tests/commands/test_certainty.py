@@ -12,7 +12,7 @@ from data_folders import write_image
 from run_folders import write_scene
 
 from beags_plugin.commands import demo, demo_training
-from beags_plugin.commands.certainty import certainty
+from beags_plugin.commands.certainty import certainty, write_doubt
 from beags_plugin.commands.made_masks import MADE, as_made
 from beags_plugin.commands.scene_setup import MadeScene
 from beags_plugin.labels.class_ids import IGNORE
@@ -59,6 +59,20 @@ def test_photos_without_poses_and_masks_to_delete_are_named(tmp_path):
     (command,) = [line for line in lines if line.startswith("    rm ")]
     assert command.count(".png'") == 6 and f"'{tmp_path}/masks/v 0.png'" in command
     assert any("(2 more)" in line for line in lines)
+
+
+@pytest.mark.parametrize(("found", "said"), [(3, False), (2, True)])
+def test_things_told_apart_are_judged_by_their_own_report_and_fewer_are_said(tmp_path, found, said):
+    run, apart = write_run(tmp_path / "run", None, []), tmp_path / "apart"
+    apart.mkdir()
+    agreement = {"agreement": 0.97, "masks": 20, "overruled": [], "doubtful": 0.004, "views": []}
+    (apart / "report.json").write_text(json.dumps({**agreement, "things": {"asked": 3, "found": found, "more": 0}}))
+    (apart / "doubt.png").write_bytes(b"drawn")
+    judged = certainty(run, tmp_path, None, "beags demo --data x --pick", apart)
+    assert judged.level == "sure" and judged.to_json()["things"]["found"] == found
+    sentence = "Only 2 things lie apart, not 3: things that touch, or that most masks lack, take clicks."
+    assert (sentence in judged.lines) is said and ("    beags demo --data x --pick --fresh" in judged.lines) is said
+    assert write_doubt(run, tmp_path / "doubt.png", apart) and (tmp_path / "doubt.png").read_bytes() == b"drawn"
 
 
 def test_masks_that_a_network_made_are_made_to_agree_and_those_that_were_mended_are_not(tmp_path, monkeypatch):

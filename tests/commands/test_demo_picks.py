@@ -85,6 +85,41 @@ def test_base_viewer_and_refinement_follow_one_another_and_each_is_done_once(sta
     assert stand.run() == ["measured"]
 
 
+def test_things_that_lie_apart_are_told_apart_on_the_base_and_masks_of_them_that_were_mended_stay(
+    stand, monkeypatch, capsys
+):
+    monkeypatch.setattr("beags_plugin.masks.sources.salient.load", lambda _: lambda photo: photo[..., 0] > -1)
+    monkeypatch.setattr("beags_plugin.commands.scene_setup.check_source", lambda chosen: None)
+
+    def split(config, options, output, things, enlarge):
+        stand.said.append(["apart", str(config), str(options.masks), str(things), str(enlarge)])
+        write_image(output / "masks/v01.png", np.full((60, 100), len(stand.said) % 2, np.uint8))
+        (output / "classes.json").write_text('{"1": "bear 1"}')
+        return ["Only one thing lies apart"]
+
+    monkeypatch.setattr("beags_plugin.objects.agree_masks.agree_masks", split)
+    assert stand.run(pick=False, objects=3) == ["base", "apart", "refined", "measured"]
+    assert "Only one thing lies apart" in capsys.readouterr().out
+    base, apart, refined, _ = stand.said
+    assert "--pipeline.model.prepare.agree" not in base + refined
+    assert apart[1:] == [str(stand.output / "pick/run/config.yml"), str(stand.output / "made/masks"), "3", "True"]
+    assert refined[refined.index("--masks-path") + 1] == str(stand.output / "apart/masks")
+    assert stand.run(pick=False, objects=3) == ["measured"]
+    with pytest.raises(UserError, match=r"that was trained with --objects 3: add --fresh to replace it \(its base is"):
+        stand.run(pick=False, objects=2)
+    assert stand.run(True, pick=False, objects=2) == ["apart", "refined", "measured"]
+    write_image(stand.output / "apart/masks/v01.png", np.full((60, 100), 7, np.uint8))
+    assert stand.run(True, pick=False, objects=3) == ["refined", "measured"]
+    assert "are not as they were made, so they stay" in capsys.readouterr().out
+
+
+def test_masks_that_nobody_made_here_hold_no_things_to_tell_apart(stand, tmp_path):
+    write_image(stand.data / "masks/v01.png", np.full((60, 100), 1, np.uint8))
+    with pytest.raises(UserError, match=r"are not a network's .* leave --objects out, or add --pick\."):
+        stand.run(pick=False, objects=2)
+    assert stand.said == []
+
+
 def test_several_objects_are_expected_under_names_that_tell_them_apart(stand):
     stand.run(objects=3)
     assert stand.said[1][-4:] == ["--expect", "bear 1", "bear 2", "bear 3"]
@@ -146,7 +181,7 @@ def test_the_base_of_a_demo_without_picks_is_used_again_and_its_run_is_replaced_
         (["--pick"], "there is nothing to pick, as the sample has masks: name photos with --data."),
         (["--data", ".", "--pick", "--objects", "0"], "objects is 0: give 1 or more."),
         (["--data", ".", "--pick", "--strict"], "leave --strict out."),
-        (["--data", ".", "--objects", "3"], "cannot tell several apart: add --pick, and click on each of the 3."),
+        (["--objects", "3"], "the sample has masks of its objects: name photos with --data, or leave --objects out."),
     ],
 )
 def test_options_that_do_not_go_together_are_refused_at_once(tmp_path, monkeypatch, capsys, words, sentence):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from importlib.util import find_spec
 from typing import ClassVar
 
@@ -47,13 +48,12 @@ def load(model: str) -> Callable[[np.ndarray], np.ndarray]:
     Raises ``UserError`` for an unknown model, and where its weights cannot be had.
     """
     try:
-        import rembg  # pyright: ignore[reportMissingImports]
-        from rembg.sessions import sessions_names  # pyright: ignore[reportMissingImports]
+        rembg, sessions = import_module("rembg"), import_module("rembg.sessions")
     except (ImportError, SystemExit) as error:  # It ends the process where it finds no onnxruntime.
         raise UserError(
             f"the library rembg cannot be imported ({error}): pip install rembg onnxruntime 'numpy<2'."
         ) from error
-    check_choice(model, sorted(set(sessions_names) - set(OTHERS)), "model", " of rembg for photos alone")
+    check_choice(model, sorted(set(sessions.sessions_names) - set(OTHERS)), "model", " of rembg for photos alone")
     try:
         session = rembg.new_session(model)
     except Exception as error:  # those of its downloads and of onnxruntime have no class in common
