@@ -72,7 +72,7 @@ def check_source(chosen: ChosenSource) -> None:
     from beags_plugin.masks.sources.salient import SalientSource, fetch_weights
 
     if chosen != SALIENT:
-        chosen.source()
+        chosen.source().check()
         return
     if reason := SalientSource.unavailable():
         raise UserError(f"there are no masks, and none can be made of what stands out: {reason}")

@@ -16,6 +16,7 @@ from test_documented_commands import training_config
 from weights import fetch
 
 from beags_plugin.commands import demo, demo_training, scene_setup
+from beags_plugin.commands.made_masks import ChosenSource
 from beags_plugin.commands.scene_setup import MadeScene
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.masks.sources.salient import SalientSource
@@ -161,19 +162,49 @@ def test_another_source_of_masks_is_asked_and_its_change_makes_them_anew(posed, 
     found = {"isnet-general-use": 90, "birefnet-general": 180}
     monkeypatch.setattr(
         "beags_plugin.masks.sources.rembg.load",
-        lambda model: asked.append(model) or (lambda photo: photo[..., 0] > found[model]),
+        lambda model: asked.append(model) or (lambda photo: photo[..., 0] > found[model]),  # to check, and to make
     )
 
     def run(*options: str) -> set[str]:
         demo.run_demo(posed, tmp_path / "out", "beags-tiny", None, 0, True, mask_source="rembg", mask_options=options)
         return {label for label in (tmp_path / "out/made/classes.json").read_text().split('"') if label.isalpha()}
 
-    assert run("name=cup") == {"background", "cup"} and asked == ["isnet-general-use"]
+    assert run("name=cup") == {"background", "cup"} and asked == 2 * ["isnet-general-use"]
     shutil.rmtree(tmp_path / "out/run")
     run("name=cup")
-    assert asked == ["isnet-general-use"], "they are as they were made"
+    assert asked[2:] == ["isnet-general-use"], "they are as they were made"
     shutil.rmtree(tmp_path / "out/run")
-    assert run("model=birefnet-general") == {"background", "data"} and asked[1:] == ["birefnet-general"]
+    assert run("model=birefnet-general") == {"background", "data"} and asked[3:] == 2 * ["birefnet-general"]
+
+
+@pytest.mark.parametrize(
+    ("chosen", "library", "sentence"),
+    [
+        (ChosenSource("rembg"), "rembg", "cannot fetch the weights of isnet-general-use"),
+        (ChosenSource("sam2", ("model=/none/such",)), "transformers", "there is no folder /none/such"),
+    ],
+)
+def test_weights_that_lack_are_named_before_poses_are_computed(
+    photos, tmp_path, monkeypatch, chosen, library, sentence
+):
+    if library == "rembg":
+        monkeypatch.setattr("beags_plugin.masks.sources.rembg.find_spec", lambda name: object())
+        monkeypatch.setattr("beags_plugin.masks.sources.rembg.import_module", lambda name: NoWeights)
+    else:
+        pytest.importorskip(library, reason="the extra [sam2] (transformers) is not installed")
+    with pytest.raises(UserError, match=sentence):
+        scene_setup.made_scene(photos, tmp_path / "out", chosen=chosen)
+    assert not (tmp_path / "out").exists()
+
+
+class NoWeights:
+    """The library rembg and its rembg.sessions, without a network."""
+
+    sessions_names = ("isnet-general-use",)
+
+    @staticmethod
+    def new_session(model: str):
+        raise ConnectionError(model)
 
 
 def test_a_source_that_does_not_fit_is_refused(posed, tmp_path):

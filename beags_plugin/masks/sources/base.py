@@ -148,6 +148,9 @@ class MaskSource(ABC):
         """Return a sentence on why the source cannot run here, or None."""
         return None
 
+    def check(self) -> None:  # noqa: B027  (most sources need no weights)
+        """Raise ``UserError`` where the weights that the options name cannot be had: before other work is done."""
+
     @abstractmethod
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         """Make the masks of all photos; raise ``UserError`` for unusable input. progress: (done, total)."""

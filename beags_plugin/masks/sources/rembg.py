@@ -38,6 +38,9 @@ class RembgSource(MaskSource):
             return "the library rembg is not installed: pip install rembg 'numpy<2'."  # its newest want numpy 2
         return None
 
+    def check(self) -> None:
+        load(self.model)
+
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         return one_object(scene, self.name, load(self.model), progress)
 

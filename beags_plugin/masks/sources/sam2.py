@@ -59,6 +59,13 @@ class Sam2Source(MaskSource):
             return "the library transformers is not installed: pip install 'transformers>=5.0'."
         return None
 
+    def check(self) -> None:
+        self._trackers()
+
+    def _trackers(self) -> list[Any]:
+        """Return the library's classes for the model and its processor."""
+        return classes(self.model, TRACKERS, "video model of SAM 2 or SAM 3", self.local)
+
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         path = scene.below(self.prompts)
         objects = read_prompts(path)
@@ -71,7 +78,7 @@ class Sam2Source(MaskSource):
         device = self.device
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
-        trackers = classes(self.model, TRACKERS, "video model of SAM 2 or SAM 3", self.local)
+        trackers = self._trackers()
         finder, detectors = self.detector, []
         if any(one.text for one in objects):
             if finder == "auto":
