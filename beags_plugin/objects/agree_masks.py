@@ -41,7 +41,7 @@ def agree_masks(
     config_path: config.yml of any run, trained with or without masks. options: of the data; those of reprojection are
     not used. output: the folder; ``agreed`` beside config.yml if None. things: above 1, the one object of the masks is
     split into so many separate things, or fewer, which are called as it is, and numbered. enlarge: masks made at the
-    run's size are written at that of the photos. Raises ``UserError`` for a run or data that cannot be used, and if no
+    run's size are written at that of the photos, and no next command is named. Raises ``UserError`` for a run or data that cannot be used, and if no
     mask of a training view names an object.
     """
     run = Run(config_path, options.data)
@@ -99,7 +99,9 @@ def agree_masks(
     said = [f"{report.sentence(names)}.", *(str(output / name) for name in written)]
     if report.things is not None and (sentence := report.things.sentence()):
         said.insert(1, sentence)
-    if options.run_size and not enlarge and _downscale(scene) != 1.0:
+    if enlarge:  # for the demo, which goes on by itself
+        return said
+    if options.run_size and _downscale(scene) != 1.0:
         return [*said, "These masks are smaller than the photos: to train with masks, make them without --run-size."]
     return [*said, f"Next: {_refinement(scene, output.absolute())}"]
 

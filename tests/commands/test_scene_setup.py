@@ -197,6 +197,17 @@ def test_weights_that_lack_are_named_before_poses_are_computed(
     assert not (tmp_path / "out").exists()
 
 
+def test_prompts_beside_the_photos_are_found_and_masks_are_made_anew_once_they_change(posed):
+    pytest.importorskip("transformers", reason="the extra [sam2] (transformers) is not installed")
+    (posed / "prompts.json").write_text("[1]")
+    chosen = ChosenSource("sam2", ("prompts=prompts.json", "model=facebook/sam3")).below(posed)
+    assert chosen.options == (f"prompts={posed / 'prompts.json'}", "model=facebook/sam3")
+    before = chosen.digest()
+    assert before == chosen.digest()
+    (posed / "prompts.json").write_text("[2]")
+    assert before != chosen.digest()
+
+
 class NoWeights:
     """The library rembg and its rembg.sessions, without a network."""
 
