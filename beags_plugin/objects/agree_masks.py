@@ -41,8 +41,8 @@ def agree_masks(
     config_path: config.yml of any run, trained with or without masks. options: of the data; those of reprojection are
     not used. output: the folder; ``agreed`` beside config.yml if None. things: above 1, the one object of the masks is
     split into so many separate things, or fewer, which are called as it is, and numbered. enlarge: masks made at the
-    run's size are written at that of the photos, and no next command is named. Raises ``UserError`` for a run or data that cannot be used, and if no
-    mask of a training view names an object.
+    run's size are written at that of the photos, and no next command is named. Raises ``UserError`` for a run or data
+    that cannot be used, and if no mask of a training view names an object.
     """
     run = Run(config_path, options.data)
     scene, manager = run.scene, data_to_reproject(run, options)
