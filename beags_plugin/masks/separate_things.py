@@ -24,7 +24,7 @@ from beags_plugin.rasterizers.rendering import draw_features, geometry_inputs
 NEIGHBOURS = 24
 GAP = 0.01  # of the size of all things: a Gaussian's light reaches beyond its deviation
 LARGEST = 0.1  # of the same: a Gaussian of such a deviation is a streak, and links nothing
-THING = 0.03  # of the light that the largest part gives: less is a crumb
+THING = 0.1  # of the light that the largest part gives: less is a crumb, as in the masks of a network
 SEEN = 0.05  # of a pixel's light: a pixel of the mask with less of the things is as the nearest with more
 
 

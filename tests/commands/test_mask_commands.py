@@ -234,3 +234,18 @@ def test_agreement_overrules_the_mask_that_contradicts_the_others(tmp_path, caps
         wrong = (found != right[name]) & (found != IGNORE)
         assert wrong.mean() < (0.05 if name == "v03" else 0.003), name
     assert len(surfels) and json.loads((tmp_path / "agreed/classes.json").read_text())["1"] == "cup"
+    assert not report.get("things")
+    agree = ["masks", "agree", "--load-config", str(config), "--objects", "2", "--output", str(tmp_path / "apart")]
+    with pytest.raises(SystemExit):
+        main(agree)
+    assert "the masks name 2 objects (cup, box), and only one can be" in " ".join(capsys.readouterr().out.split())
+    (data / "classes.json").write_text('{"0": "background", "1": "thing"}')
+    for name, mask in right.items():
+        write_image(data / f"masks/{name}.png", (mask > 0).astype(np.uint8))
+    main(agree)
+    assert "lies apart" not in capsys.readouterr().out
+    names = {"0": "background", "1": "thing 1", "2": "thing 2"}
+    assert json.loads((tmp_path / "apart/classes.json").read_text()) == names
+    split = {name: read_id_mask(tmp_path / f"apart/masks/{name}.png") for name in sorted(right)[1:8]}
+    ids = np.array([0, 1, 2]) if (split["v01"][right["v01"] == 1] == 1).mean() > 0.5 else np.array([0, 2, 1])
+    assert all((split[name] == ids[right[name]]).mean() > 0.97 for name in split)
