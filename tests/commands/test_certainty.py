@@ -101,8 +101,8 @@ def test_strict_stops_before_training_where_masks_contradict(tmp_path, monkeypat
     with pytest.raises(UserError, match=r"1 masks contradict the others \(v03; see .*contradicted.png\)"):
         demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, False, True)
     assert not (tmp_path / "out/run").exists()
-    monkeypatch.setattr(demo, "train_once", lambda *_: None)
-    monkeypatch.setattr(demo, "measure", lambda *_: None)
+    monkeypatch.setattr(demo, "train_once", lambda *_, **__: None)
+    monkeypatch.setattr(demo, "measure", lambda *_, **__: None)
     demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, False)
     report.contradictions.clear()
     demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, False, True)
