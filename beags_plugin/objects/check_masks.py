@@ -167,6 +167,7 @@ def _files(config: DataOptions) -> tuple[Dataset, PosedViews, MaskFiles]:
     sizes = [image_size(path) for path in views.images]
     parser.fit_cameras(views, sizes)
     masks, folder, kind = parser.mask_files(scene, views)
+    parser.check_folder(folder)
     trained = set(parser.views_of_split(views, "train"))
     parser.views_of_split(views, "val")  # without which training stops
     names_file = scene.root / config.classes_path

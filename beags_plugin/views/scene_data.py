@@ -126,7 +126,9 @@ class SceneData:
         present = [mask for mask in masks if mask is not None and kind == "ids"]
         truth = (scene.root / config.ground_truth_path, views.images, images_root(scene))
         classes_file = scene.root / config.classes_path
-        self._check_named(folder, classes_file)
+        self.check_folder(folder)
+        if classes_file.is_dir() or not (config.classes_path == Path("classes.json") or classes_file.is_file()):
+            raise UserError(f"the class names {classes_file} are no file: correct classes_path.")
         known = (scene.class_names, scene.class_names_file)
         return {
             **starting_points(scene, views, config.num_random_points),
@@ -139,13 +141,12 @@ class SceneData:
             "stray_truth": stray_note(*truth) if self._truth else None,
         }
 
-    def _check_named(self, masks: Path, classes: Path) -> None:
-        """Raise ``UserError`` where the user has named masks or classes that are not there."""
+    def check_folder(self, masks: Path) -> None:
+        """Raise ``UserError`` where the user has named a folder of masks that is not there."""
         if self.config.masks_path is not None and not masks.is_dir():
-            raise UserError(f"the folder of masks {masks} does not exist: correct masks_path.")
-        usual = self.config.classes_path == Path("classes.json")
-        if classes.is_dir() or not (usual or classes.is_file()):
-            raise UserError(f"the class names {classes} are no file: correct classes_path.")
+            raise UserError(
+                f"the folder of masks {masks} does not exist: correct masks_path; a relative one lies in the scene."
+            )
 
     def fit_cameras(self, views: PosedViews, sizes: Sequence[tuple[int, int]]) -> None:
         """Resize the cameras in place to the loaded images: the files' sizes divided by the downscale factor."""

@@ -5,9 +5,13 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
+import pytest
 import tyro
+from run_folders import write_scene
 
 from beags_plugin.commands.masks import Agree, Check
+from beags_plugin.objects.check_masks import check, options_beside
+from beags_plugin.system.errors import UserError
 
 
 def test_the_command_that_makes_masks_agree_names_the_same_run_data_and_masks(tmp_path):
@@ -22,3 +26,10 @@ def test_the_command_that_makes_masks_agree_names_the_same_run_data_and_masks(tm
 def test_masks_agree_takes_output_dir_too():
     agree = tyro.cli(Agree, args=["--load-config", "run", "--output-dir", "there"])
     assert agree.output == Path("there")
+
+
+def test_a_folder_of_masks_that_is_not_in_the_scene_is_told_where_it_was_looked_for(tmp_path):
+    """A shell completes paths from where one stands; what makes masks would be told of a scene that is not there."""
+    data = write_scene(tmp_path / "lab")
+    with pytest.raises(UserError, match=r"lab/runs/picked/masks does not exist: .* a relative one lies in the scene"):
+        check(options_beside(None, data, masks_path=Path("runs/picked/masks")))
