@@ -113,6 +113,19 @@ def test_paths_in_config_yml_are_words_that_people_edit(config, tmp_path):
         assert read.data_config.data.parent == Path("/data/your scene")
 
 
+def test_a_saved_config_names_no_folder_but_those_that_were_given(tmp_path, monkeypatch):
+    """The data parser's folder, left at its default, would be the one that ns-train was called in."""
+    from beags_plugin.plugin.presets import preset_config
+
+    (tmp_path / "called_here").mkdir()
+    monkeypatch.chdir(tmp_path / "called_here")
+    config = preset_config("beags-tiny", {}, tmp_path / "run")
+    config.run_dir, config.data_config.data = tmp_path / "run", tmp_path / "lab"
+    config.save_config()
+    text = (tmp_path / "run/config.yml").read_text("utf8")
+    assert text.count(f"[{tmp_path / 'lab'}]") >= 2 and f"[{tmp_path / 'called_here'}]" not in text
+
+
 def test_every_preset_can_be_read_back(tmp_path):
     import yaml
 

@@ -175,6 +175,8 @@ class BeagsTrainerConfig(TrainerConfig):
         for name in ("run_dir", "load_dir", "load_checkpoint"):
             if (path := getattr(self, name)) is not None:
                 setattr(self, name, Path(path).absolute())
+        if self.data_config.data is not None:  # nerfstudio lets the data parser have it when a run begins
+            self.data_config.dataparser.data = self.data_config.data
         for holder in (self, self.data_config, self.data_config.dataparser):
             if (data := getattr(holder, "data", None)) is not None:
                 holder.data = Path(data).absolute()
