@@ -45,6 +45,7 @@ BELIEF = 0.3  # of the logit of p, beside links of at most 1
 BOUND = 1e3  # more than all links of a Gaussian can be worth
 NOTHING = -30.0  # logit of an opacity that no picture shows
 MUCH = 0.5  # of the scene: a cut that takes more may be right, but is said
+LITTLE, FEW = 0.002, 100  # of the scene, and Gaussians: a cut that takes less of both is said too
 LIMIT = 1e-6  # of p, so that its logit is finite
 
 
@@ -55,6 +56,14 @@ def takes_much(members: Tensor) -> str | None:
         return None
     percent = math.ceil(100.0 * share - 1e-9)
     return f"more than half of the scene ({percent}%): if that is too much, mark what is beside it or draw a box"
+
+
+def takes_little(members: Tensor) -> str | None:
+    """Return what to say of a cut, [N] bool, that has hardly left its points, or None."""
+    count = int(members.sum())
+    if count >= min(FEW, LITTLE * len(members)):
+        return None
+    return "little more than the points themselves: click on other parts of the object too, or press Grow"
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import torch
 from touching_solids import SETTINGS, marks, pixel_of, solids, views
 
 from beags_plugin.core.regions import Ball, Block, HalfSpace
-from beags_plugin.picking.cutter import Cutter, takes_much
+from beags_plugin.picking.cutter import Cutter, takes_little, takes_much
 from beags_plugin.picking.walk import Walker
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import FLOATS
@@ -168,6 +168,11 @@ def test_a_cut_of_more_than_half_of_the_scene_is_said(count):
     said = takes_much(torch.arange(100) < count)
     assert said is None if count == 50 else said is not None and "more than half of the scene (51%)" in said
     assert "(51%)" in str(takes_much(torch.arange(1000) < 501))
+
+
+@pytest.mark.parametrize("count, scene, is_said", [(2, 9_000, True), (20, 9_000, False), (99, 10**6, True)])
+def test_a_cut_that_has_hardly_left_its_points_is_said(count, scene, is_said):
+    assert ("click on other parts" in str(takes_little(torch.arange(scene) < count))) is is_said
 
 
 def test_a_cut_of_the_whole_scene_is_refused():

@@ -17,7 +17,7 @@ from beags_plugin.core.membership import Membership
 from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.labels.colors import colorize
 from beags_plugin.objects.picked_masks import save_masks
-from beags_plugin.picking.cutter import Cutter, takes_much
+from beags_plugin.picking.cutter import Cutter, takes_little, takes_much
 from beags_plugin.picking.picks import Picks
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.viewer.choice import Visible
@@ -196,8 +196,8 @@ class PickWork:
             + (f"{int((former & ~one.members).sum()):,} fewer than before")
         )
         took = "" if seconds is None else f" ({seconds:.1f} s)"
-        much = takes_much(one.members)
-        return f"{one.name}: {count:,} Gaussians{more}{took}." + (f" This is {much}." if much else "")
+        remark = takes_much(one.members) or takes_little(one.members)
+        return f"{one.name}: {count:,} Gaussians{more}{took}." + (f" This is {remark}." if remark else "")
 
     # -- the thread --------------------------------------------------------------------------------------------------
 

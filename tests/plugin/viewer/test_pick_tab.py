@@ -31,6 +31,7 @@ from beags_plugin.labels.colors import colorize
 from beags_plugin.objects.export import export_run
 from beags_plugin.objects.extract import extract_objects
 from beags_plugin.objects.picked_masks import option_words
+from beags_plugin.picking.picks import Picked, Picks
 from beags_plugin.plugin.viewer.legend import pasteable
 from beags_plugin.plugin.viewer.other_sides import other_sides
 from beags_plugin.plugin.viewer.pick_work import FIRST_COLOR
@@ -115,6 +116,12 @@ def test_a_cut_of_more_than_half_of_the_scene_is_said(opened):
     assert "half of the scene" not in click(tab, POINTS["low"], "Gaussians")
     tab.work.change(lambda picks: picks.another())
     assert "This is more than half of the scene (" in click(tab, POINTS["floor"], "Gaussians")
+
+
+def test_a_cut_of_next_to_nothing_is_said(opened):
+    tab, _ = opened()
+    tab.work.picks = Picks((Picked("low", members=torch.arange(len(OWNER)) == 7),))
+    assert "low: 1 Gaussians. This is little more than the points themselves" in tab.work._summary()
 
 
 def test_only_what_is_picked_is_shown_and_exported(opened):
