@@ -46,6 +46,11 @@ class Choice:
         isolated = class_id if self.isolated == class_id else None
         return replace(self, hidden=self.hidden - {class_id}, removed=self.removed - {class_id}, isolated=isolated)
 
+    def after(self, action: str, class_id: int) -> Choice:
+        """Apply a button of the panel: "Isolate", "Show", "Hide" or "Remove"."""
+        change = {"Isolate": self.isolate, "Show": self.show, "Hide": self.hide, "Remove": self.remove}
+        return change[action](class_id)
+
     def show_all(self) -> Choice:
         """Show every class again."""
         return replace(self, hidden=frozenset(), removed=frozenset(), isolated=None)

@@ -24,18 +24,23 @@ from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.plugin.viewer.aim import frame_of, look, look_as, side_of_photos
 from beags_plugin.plugin.viewer.clicks import SceneClicks
 from beags_plugin.plugin.viewer.export import ShownFiles
-from beags_plugin.plugin.viewer.legend import LegendRow, capitalised, escaped, legend, unique_labels
+from beags_plugin.plugin.viewer.legend import LegendRow, capitalised, escaped, legend
+from beags_plugin.plugin.viewer.listed import Listed
 from beags_plugin.plugin.viewer.pick_tab import PickTab
 from beags_plugin.plugin.viewer.pick_work import take_picked
 from beags_plugin.plugin.viewer.picking import under_cursor
 from beags_plugin.plugin.viewer.serving import (
+    crop_box_of,
     end_when_interrupted,
     first_folder,
     hide_training_cameras,
     offer_whole_pictures,
+    outputs_of,
+    repeat,
     set_pace,
 )
 from beags_plugin.plugin.viewer.size_tab import SizeTab
+from beags_plugin.plugin.viewer.to_paste import show_to_paste
 from beags_plugin.plugin.viewer.viewed_run import ViewedRun
 from beags_plugin.plugin.viewer.viewing import NO_CLASSES, Viewing
 from beags_plugin.plugin.viewer.window import Windows, shown_finished
@@ -60,8 +65,8 @@ class ObjectPanel(ViewerElement[None]):
     def __init__(self, viewing: Viewing) -> None:
         super().__init__("Objects")
         self.viewing = viewing
+        self.listed = Listed()
         self.labels: dict[str, int] = {}
-        self.counts: dict[int, int] = {}
         self.notes: dict[str, str] = {}
         self.viewer: Viewer | None = None
         self._link: ViewerControl | None = None
@@ -73,8 +78,6 @@ class ObjectPanel(ViewerElement[None]):
         self._windows: Windows | None = None
         self._legend: Any = None
         self._status: Any = None
-        self._counted: tuple | None = None
-        self._texts = ["", ""]
         self.object = ViewerDropdown("Object", NONE, [NONE], hint="Also chosen by picking")
         # two rows: four buttons in one are cut off
         self.look = ViewerButtonGroup("Look at it", "Isolate", ["Isolate", "Show"], cb_hook=self._act)
@@ -163,6 +166,7 @@ class ObjectPanel(ViewerElement[None]):
         """Pace a new page's pictures, and let it begin at the objects."""
         assert self.viewer is not None
         set_pace(self.viewer, client.client_id, self.viewing.pace, self._windows)
+        show_to_paste(client.gui)
         # not here: no message of the page is read while this runs
         threading.Thread(target=self.centre, args=(client, True), daemon=True).start()
 
@@ -210,9 +214,7 @@ class ObjectPanel(ViewerElement[None]):
         if class_id is None:
             self.note("object", f"Nothing to choose: {NO_CLASSES}")
             return
-        choice = self.viewing.choice
-        change = {"Isolate": choice.isolate, "Hide": choice.hide, "Remove": choice.remove, "Show": choice.show}
-        self.choose(change[action](class_id))
+        self.choose(self.viewing.choice.after(action, class_id))
 
     def _slide(self, **values: float) -> None:
         self.choose(replace(self.viewing.choice, **values))
@@ -240,12 +242,7 @@ class ObjectPanel(ViewerElement[None]):
     # -- following the scene -------------------------------------------------------------------------------------------
 
     def _follow(self) -> None:
-        pause = threading.Event()
-        while not pause.wait(REFRESH_SECONDS):
-            try:
-                self.follow()
-            except Exception as error:  # the panel must not stay behind for good
-                self.note("panel", f"{type(error).__name__}: {error}")
+        repeat(self.follow, REFRESH_SECONDS, lambda text: self.note("panel", text))
 
     def follow(self) -> None:
         """Update the panel, read or compute the picture that the viewer lacks, and then ask for a new rendering."""
@@ -259,34 +256,17 @@ class ObjectPanel(ViewerElement[None]):
                 self._redraw()
 
     def _wanted(self) -> frozenset[str]:
-        if self.viewer is None:
-            return frozenset()
-        controls = self.viewer.control_panel
-        return frozenset({controls.output_render} | ({controls.split_output_render} if controls.split else set()))
+        return frozenset() if self.viewer is None else outputs_of(self.viewer.control_panel)
 
     def _crop_box(self) -> OrientedBox | None:
         assert self.viewer is not None  # it is there when this is asked for
-        controls = self.viewer.control_panel
-        return controls.crop_obb if controls.crop_viewport else None
+        return crop_box_of(self.viewer.control_panel)
 
     def refresh_objects(self) -> None:
         """List the classes that have Gaussians, under the names that the model now has."""
-        model = self.viewing.model
-        ids = model.class_ids
-        key = (
-            bool(model.assigned),
-            ids.data_ptr(),
-            len(ids),
-            ids._version,
-            id(model.objects),
-            tuple(model.classes.items()),
-        )
-        if key == self._counted:
+        if not self.listed.refresh(self.viewing.model):
             return
-        members = model.members()
-        self.counts = {c: int(members.of(c).sum()) for c in members.present()} if key[0] else {}
-        self.labels = unique_labels({class_id: model.classes.get(class_id, "") for class_id in self.counts})
-        self._counted = key
+        self.labels = self.listed.labels
         options, former = list(self.labels) or [NONE], self.object.value
         if self.object.options != options:
             self.object.set_options(options)
@@ -305,11 +285,12 @@ class ObjectPanel(ViewerElement[None]):
         """Write legend and notes, if they have changed."""
         choice = self.viewing.choice
         rows = [
-            LegendRow(class_id, name, self.counts[class_id], choice.state(class_id))
+            LegendRow(class_id, name, self.listed.counts[class_id], choice.state(class_id))
             for name, class_id in self.labels.items()
         ]
         lines = {**self.viewing.notes, **self.notes}
-        texts = [legend(rows) if rows else escaped(f"No objects: {NO_CLASSES}")]
+        pick = "" if self.pick_tab is None else " Without masks, pick objects in the tab Pick."
+        texts = [legend(rows) if rows else escaped(f"No objects: {NO_CLASSES}{pick}")]
         texts.append("\n\n".join(escaped(line) for line in lines.values() if line))
         for index, (handle, text) in enumerate(zip((self._legend, self._status), texts, strict=True)):
             if handle is not None and text != self._texts[index]:

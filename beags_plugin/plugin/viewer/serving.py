@@ -14,6 +14,8 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from beags_plugin.plugin.viewer.pace import Pace
 
 if TYPE_CHECKING:
+    from nerfstudio.data.scene_box import OrientedBox
+    from nerfstudio.viewer.control_panel import ControlPanel
     from nerfstudio.viewer.viewer import Viewer
     from viser import GuiApi, GuiTabHandle, ViserServer
 
@@ -94,6 +96,16 @@ def hide_training_cameras(viewer: Viewer, hit: Callable[[int], None]) -> None:
     viewer.init_scene = draw_hidden  # type: ignore[method-assign]
 
 
+def outputs_of(controls: ControlPanel) -> frozenset[str]:
+    """Return the outputs that a viewer shows: one, or two on its split screen."""
+    return frozenset({controls.output_render} | ({controls.split_output_render} if controls.split else set()))
+
+
+def crop_box_of(controls: ControlPanel) -> OrientedBox | None:
+    """Return the box to which a viewer crops the scene; None where it does not."""
+    return controls.crop_obb if controls.crop_viewport else None
+
+
 def offer_whole_pictures(controls: Any) -> None:
     """Leave nerfstudio's "gl_z_buf_depth" out of the lists of outputs.
 
@@ -102,6 +114,16 @@ def offer_whole_pictures(controls: Any) -> None:
     """
     offer = controls.update_output_options
     controls.update_output_options = lambda names: offer([name for name in names if name != "gl_z_buf_depth"])
+
+
+def repeat(step: Callable[[], None], seconds: float, failed: Callable[[str], None]) -> None:
+    """Do a step every ``seconds``, for good: an exception does not end it. failed: receives a word about each."""
+    pause = threading.Event()
+    while not pause.wait(seconds):
+        try:
+            step()
+        except Exception as error:
+            failed(f"{type(error).__name__}: {error}")
 
 
 def end_rendering(viewer: object, seconds: float = 30.0) -> None:

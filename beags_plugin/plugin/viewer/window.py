@@ -79,6 +79,9 @@ def shown_finished(viewer: Viewer) -> Windows:
     viewer.pause_train.visible = viewer.resume_train.visible = False
     for control in (viewer.control_panel._train_speed, viewer.control_panel._train_util):
         control.set_hidden(True)
+    # nerfstudio leaves the step of a finished run at 0, so the size is shown alone
+    viewer.make_stats_markdown = lambda step, size: f"Resolution: {size}"  # type: ignore[method-assign]
+    viewer.stats_markdown.content = ""
     viewer.viser_server.gui.configure_theme(
         titlebar_content=None, control_layout="collapsible", dark_mode=True, brand_color=(255, 211, 105)
     )

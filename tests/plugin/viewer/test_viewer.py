@@ -119,8 +119,8 @@ def test_objects_that_overlap_are_drawn_as_each_would_be_alone(window, class_id)
                 assert torch.equal(overlapping["class_confidence"], exclusive["class_confidence"])
         model.take_members(members)
         panel.follow()
-        assert panel.counts == {c: int(members.of(c).sum()) for c in (0, 1, 2)}
-        assert sum(panel.counts.values()) == len(phi) + int(shared.sum())
+        assert panel.listed.counts == {c: int(members.of(c).sum()) for c in (0, 1, 2)}
+        assert sum(panel.listed.counts.values()) == len(phi) + int(shared.sum())
     finally:
         model.take_members(plain)
 
@@ -280,6 +280,19 @@ def test_odd_names_and_classes_that_come_later(window):
     model.assigned.fill_(True)
     model.set_extra_state(classes)
     panel.follow()
+
+
+def test_a_finished_run_shows_no_step_and_where_objects_are_picked(window):
+    """nerfstudio would say "Step: 0" of every one."""
+    assert "Step" not in window.viewer.stats_markdown.content
+    window.look()
+    assert re.fullmatch(r"Resolution: \d+x\d+px", window.viewer.stats_markdown.content)
+    window.model.assigned.fill_(False)
+    window.panel.follow()
+    assert "pick objects in the tab Pick" in window.panel._legend.content
+    window.model.assigned.fill_(True)
+    window.panel.follow()
+    assert "tab Pick" not in window.panel._legend.content
 
 
 def test_panel_and_legend_do_not_wait_for_a_step_but_the_click_does(window, monkeypatch):
