@@ -34,7 +34,7 @@ def to_paste(text: str) -> str:
     if (found := _SHOWN.fullmatch(text)) is None:
         return text
     program, *options = re.split(r" (?=--)", found["command"].strip())
-    values = dict(option.partition(" ")[::2] for option in options)
+    values = {name: value for name, _, value in (option.partition(" ") for option in options)}
     theirs = " ".join([program, *(_option(*each) for each in values.items())])
     if program != "ns-render camera-path":
         return f"{found['before']}\n\n{pasteable(theirs)}"

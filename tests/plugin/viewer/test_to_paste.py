@@ -76,15 +76,12 @@ def test_a_camera_path_is_rendered_by_what_the_window_shows(tmp_path, monkeypatc
 
 def test_commands_of_the_tab_export_are_whole_too():
     page = Page()
-    box = "--obb_center 0.1 -0.2 0.3"
-    show_command_modal(
-        SimpleNamespace(gui=page),  # type: ignore[arg-type]
-        "mesh",
-        f"ns-export poisson --load-config /a b/config.yml --output-dir exports/my mesh/ --num-points 9 {box}",
-    )
-    ((*words,),) = page.commands()
-    assert words[:6] == ["ns-export", "poisson", "--load-config", "/a b/config.yml", "--output-dir", "exports/my mesh/"]
-    assert words[6:] == ["--num-points", "9", *box.split()]
+    box = "--obb_center 0.1 -0.2 0.3 --obb_scale 1 2 3"
+    told = f"ns-export gaussian-splat --load-config /a b/config.yml --output-dir exports/my splat/ {box}"
+    show_command_modal(SimpleNamespace(gui=page), "splat", told)  # type: ignore[arg-type]
+    (words,) = page.commands()
+    assert words[:4] == ["ns-export", "gaussian-splat", "--load-config", "/a b/config.yml"]
+    assert words[4:] == ["--output-dir", "exports/my splat/", *box.split()]
 
 
 def test_other_texts_are_left_alone():
