@@ -91,3 +91,10 @@ def test_tests_that_scripts_call_exist():
             for name in names[1].split(",") if names else [""]:
                 path = re.sub(r"\{[\w,]+\}", name, pattern)
                 assert (ROOT / path).is_file(), f"{script.name} calls {path}, which is not there"
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/viewer.md"])
+def test_what_runs_of_others_may_do_stands_before_the_command_that_opens_one(page):
+    before, command, _ = " ".join((ROOT / page).read_text("utf-8").split()).partition(" beags view outputs/... ")
+    assert command and "listens on all addresses" in before
+    assert re.search(r"(execute|run code).{0,40}name", before)
