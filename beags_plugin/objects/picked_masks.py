@@ -43,17 +43,21 @@ def masks_folder(run: Path) -> Path:
 
 
 def save_masks(
-    config_path: Path, members: Membership, names: Mapping[int, str], folder: Path | None = None
+    config_path: Path,
+    members: Membership,
+    names: Mapping[int, str],
+    folder: Path | None = None,
+    photos: Path | None = None,
 ) -> SavedMasks:
     """Write masks of all training views, classes.json and made.png.
 
-    config_path: of the run. members: of its Gaussians. folder: for the masks; that of ``masks_folder`` if None. Raises
-    ``UserError`` if there is no object, where files cannot be written, and for a folder with masks that were not
-    written here, or have been changed since.
+    config_path: of the run. members: of its Gaussians. folder: for the masks; that of ``masks_folder`` if None. photos:
+    folder of the scene, if not where the run was trained on it. Raises ``UserError`` if there is no object, where files
+    cannot be written, and for a folder with masks that were not written here, or have been changed since.
     """
     if not any(class_id != BACKGROUND for class_id in members.present()):
         raise UserError("nothing has been picked yet: click on an object first.")
-    run, data = config_path.parent, options_beside(config_path, None)
+    run, data = config_path.parent, options_beside(config_path, photos)
     scene = Path(data.data).absolute()
     scene = scene if scene.is_dir() else scene.parent
     folder = masks_folder(run) if folder is None else folder.absolute()
@@ -66,7 +70,7 @@ def save_masks(
     own: dict[str, Any] = {"masks_path": None, "classes_path": Path("classes.json"), "ignore_ids": ()}
     if folder != scene:
         own |= {"masks_path": folder / "masks", "classes_path": folder / "classes.json"}
-    return SavedMasks(said, refinement_command(open_run(config_path), replace(data, **own)))
+    return SavedMasks(said, refinement_command(open_run(config_path, photos), replace(data, **own)))
 
 
 def refinement_command(config: RunConfig, parser: DataOptions) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from beags_plugin.labels.colors import colorize
 
+WORDS_APART = '{" "}'  # between the words of a command
 _LONGEST = 40  # characters of a name that the panel's width has room for
 
 
@@ -45,9 +46,11 @@ def wrapped(text: str) -> str:
 
 
 def pasteable(command: str) -> str:
-    """Return a command to copy: one click chooses all of it."""
+    """Return a command to copy: one click chooses all of it. No line ends after the hyphen of an option."""
     style = '{{whiteSpace: "pre-wrap", overflowWrap: "anywhere", userSelect: "all", fontSize: "0.8em"}}'
-    return f"<pre style={style}>{_literal(command)}</pre>"
+    whole = '{{display: "inline-block", maxWidth: "100%"}}'
+    words = [f"<span style={whole}>{_literal(word)}</span>" if word else "" for word in command.split(" ")]
+    return f"<pre style={style}>{WORDS_APART.join(words)}</pre>"
 
 
 def _literal(text: str) -> str:

@@ -133,7 +133,7 @@ class PickWork:
             self._report("Drawing masks of all training views ...")
             if errand is not None:  # classes of masks that the scene may have are not asked for
                 names = {each: name for each, name in names.items() if each in (BACKGROUND, *members.present())}
-            saved = save_masks(self._run() / "config.yml", members, names, folder)
+            saved = save_masks(self._run() / "config.yml", members, names, folder, self._photos())
             if ended is not None:
                 say(saved.said)
                 self._report(f"{saved.said} The viewer closes now; the program that opened it goes on.")
@@ -183,6 +183,12 @@ class PickWork:
     def _run(self) -> Path:
         assert self._viewing.run is not None  # the panel that picks is made for one
         return self._viewing.run.folder
+
+    def _photos(self) -> Path | None:
+        """Return the folder of the scene that the viewer has read, which may have been named when it was opened."""
+        assert self._viewing.run is not None
+        data = self._viewing.run.datamanager.config.data
+        return None if data is None else Path(data).absolute()
 
     def _summary(self, former: Tensor | None = None, seconds: float | None = None) -> str:
         one = self.picks.chosen

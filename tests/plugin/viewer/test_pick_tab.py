@@ -238,6 +238,17 @@ def test_masks_are_saved_for_training_views_and_never_over_others(opened, capsys
     assert len(list((lab / "masks").glob("*.png"))) == len(files) and "--masks-path" not in tab.command
 
 
+def test_masks_are_saved_for_photos_that_were_named_when_the_viewer_was_opened(opened, tmp_path):
+    """As by ``beags view RUN --data X``, where those that the run was trained on are gone."""
+    tab, config = opened()
+    moved = tmp_path / "photos elsewhere"
+    (config.parent.parent / "lab").rename(moved)
+    tab.viewing.run.datamanager.config.data = moved
+    click(tab, POINTS["low"], "Gaussians")
+    press(tab, tab.work.save_masks, "Saved")
+    assert parsed_command(tab.command)[0]["data"] == moved
+
+
 def parsed_command(command: str):
     """Return --data and --load-dir of a command of ns-train, and the options of beags-data, as ns-train parses them."""
     program, preset, *words = shlex.split(command)

@@ -37,9 +37,10 @@ class Page:
 
     def commands(self) -> list[list[str]]:
         """Return the words of every command that is shown."""
-        blocks = re.findall(r"<pre style=\{\{([^}]*)\}\}>\{(.*?)\}</pre>", self.texts[-1])
+        blocks = re.findall(r"<pre style=\{\{([^}]*)\}\}>(.*?)</pre>", self.texts[-1])
         assert all('whiteSpace: "pre-wrap"' in style for style, _ in blocks)
-        return [shlex.split(json.loads(text)) for _, text in blocks]
+        words = [re.findall(r"\{(\"[^\"]*\")\}</span>", text) for _, text in blocks]
+        return [shlex.split(" ".join(map(json.loads, each))) for each in words]
 
 
 def press(window: Window, label: str, client: object) -> None:

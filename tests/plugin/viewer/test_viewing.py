@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import fields
 
 import numpy as np
@@ -21,6 +22,7 @@ from beags_plugin.occupancy.violation import violation_shares
 from beags_plugin.plugin.viewer.aim import frame_of, place, side_of_photos
 from beags_plugin.plugin.viewer.choice import Choice, shown
 from beags_plugin.plugin.viewer.legend import (
+    WORDS_APART,
     LegendRow,
     escaped,
     hex_color,
@@ -301,13 +303,22 @@ def test_no_name_can_be_taken_for_a_program():
     assert escaped("a.b") == "a.b"
 
 
-@pytest.mark.parametrize("show", [wrapped, pasteable])
-def test_a_text_is_shown_as_it_is_and_its_longest_word_breaks(show):
-    text = "ns-train --data '/a b/{x}<b>\"![y](z)' `q`"
-    page = show(text)
+ODD = "ns-train --data '/a  b/{x}<b>\"![y](z)' `q`"
+
+
+def test_a_text_is_shown_as_it_is_and_its_longest_word_breaks():
+    page = wrapped(ODD)
     assert "overflowWrap" in page and "![" not in page and page.count("<") == 2
     inner = page.partition(">{")[2].rpartition("}</")[0]
-    assert json.loads(inner) == text  # a string of JavaScript
+    assert json.loads(inner) == ODD  # a string of JavaScript
+
+
+def test_a_command_is_shown_word_by_word_so_that_no_option_is_torn():
+    page = pasteable(ODD)
+    assert "overflowWrap" in page and "![" not in page
+    inner = re.fullmatch(r"<pre style=\{\{[^}]*\}\}>(.*)</pre>", page)[1]
+    spans = [re.fullmatch(r"(?:<span [^>]*>\{(.*)\}</span>)?", part)[1] for part in inner.split(WORDS_APART)]
+    assert " ".join(json.loads(span) if span else "" for span in spans) == ODD
 
 
 def test_labels_are_unique_never_empty_and_in_the_order_of_ids():
