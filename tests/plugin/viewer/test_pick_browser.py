@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 
 import numpy as np
 import pytest
@@ -184,6 +185,8 @@ def test_objects_are_picked_saved_refined_and_kept(served):
         f" && e.scrollWidth > e.clientWidth + 1 && 0 < e.clientWidth && e.clientWidth <= {WIDTH // 2}).length"
     )
     assert page.evaluate(wide) == 0  # no text runs off the panel
+    copied = page.evaluate("[...document.querySelectorAll('pre')].find(e => e.innerText.includes('refine')).innerText")
+    assert {"ns-train", "--masks-path", str(run / "picked/masks")} <= set(shlex.split(copied))
     assert not (lab / "masks").exists()
     saved = run / "picked"
     names = json.loads((saved / "classes.json").read_text())
