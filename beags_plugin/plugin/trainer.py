@@ -68,7 +68,7 @@ class BeagsTrainer(Trainer):
         """Take the steps of this run, which some refiners tell from the data."""
         self.schedule = schedule
         self.last_step = self._asked_steps or schedule.total
-        self.config.max_num_iterations = self.last_step  # of which nerfstudio prints a percentage
+        self.config.max_num_iterations = self.last_step  # nerfstudio prints percentages of it
 
     @property
     def _model(self) -> SceneModel:

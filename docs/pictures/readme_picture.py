@@ -56,7 +56,7 @@ class Picture:
         stand = orbit_frame(*bounding_box(parts["after"]), photos)
         cameras = orbit(stand, 12, self.height)
         rows = []
-        for caption, part in (("classes alone", parts["before"]), ("refined", parts["after"])):
+        for caption, part in (("before", parts["before"]), ("after", parts["after"])):
             in_view = render_alone(part, view.camera, run.settings, run.rasterizer, "checker")
             sides = [
                 render_alone(part, cameras[number], orbit_settings(stand), run.rasterizer, "checker")

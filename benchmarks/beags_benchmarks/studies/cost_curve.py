@@ -15,7 +15,7 @@ from beags_benchmarks.experiments.results import MEAN
 from beags_benchmarks.studies.page_tables import CAPTURES, ROOT
 
 LABELS = {
-    "assignment alone": "classes alone",
+    "assignment alone": "assignment alone",
     "the paper's losses": "the paper's losses, 3,000 steps",
     "beags-refine": "beags-refine, 800 steps",
     "beags-fast": "beags-fast, 200 steps",
