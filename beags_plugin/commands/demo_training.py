@@ -84,7 +84,7 @@ def difference(stamp: dict[str, Any], request: dict[str, Any]) -> str:
     if bool(former.get("pick")) != bool(request.get("pick")):
         return "with --pick" if former.get("pick") else "without --pick"
     if former.get("objects") != request.get("objects"):
-        return f"with --objects {former['objects']}" if "objects" in former else "without --objects"
+        return " ".join(("with --objects", str(former["objects"]))) if "objects" in former else "without --objects"
     for name, flag in (("preset", "--preset"), ("downscale", "--downscale")):
         if former.get(name) != request.get(name):
             return f"with {flag} {former.get(name)}"
