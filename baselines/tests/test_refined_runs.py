@@ -160,7 +160,7 @@ def test_the_viewer_shows_the_objects_of_every_refiner(refined, name, monkeypatc
         outputs = viewing.outputs
         monkeypatch.setattr(viewing, "outputs", lambda camera: cameras.append(camera) or outputs(camera))
         whole = window.look_as_it_opens()["rgb"]
-        assert panel.counts == {c: int(members.of(c).sum()) for c in members.present()}
+        assert panel.listed.counts == {c: int(members.of(c).sum()) for c in members.present()}
         for class_id in members.present():
             panel.object.value = scene.classes[class_id]
             panel.act("Isolate")
