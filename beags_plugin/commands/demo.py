@@ -40,8 +40,10 @@ if TYPE_CHECKING:
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 BEFORE = ("sample", "poses", "poses and masks", "base training")  # stages before the training that is measured
 PRESET, PRESET_OF_PHOTOS = "beags-tiny", "beags-fast"
-SIZE, DOWNSCALE = (640, 480), 2.5  # of the generated photos, and how whole ones are trained on
-GENERATED = ("--pipeline.datamanager.focus", "auto", "--pipeline.datamanager.dense-seeds", "off")  # of such photos
+SIZE, DOWNSCALE = (640, 480), 2.5
+"""Width and height of the generated photos, and what whole ones are divided by in training."""
+GENERATED = ("--pipeline.datamanager.focus", "auto", "--pipeline.datamanager.dense-seeds", "off")
+"""Options of training on the generated photos."""
 
 
 def run_demo(

@@ -99,7 +99,7 @@ def agree_masks(
     said = [f"{report.sentence(names)}.", *(str(output / name) for name in written)]
     if report.things is not None and (sentence := report.things.sentence()):
         said.insert(1, sentence)
-    if enlarge:  # for the demo, which goes on by itself
+    if enlarge:  # The demo asks for this: it goes on by itself.
         return said
     if options.run_size and _downscale(scene) != 1.0:
         return [*said, "These masks are smaller than the photos: to train with masks, make them without --run-size."]

@@ -24,7 +24,8 @@ class LightMap:
         self.mesh = mesh
         corners = mesh.vertices[mesh.triangles]
         edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-        self._steps = np.maximum(np.ceil(edges.max(axis=1) / spacing), 1.0).astype(np.int64)  # of each triangle's sides
+        # Each triangle's sides are divided into so many steps.
+        self._steps = np.maximum(np.ceil(edges.max(axis=1) / spacing), 1.0).astype(np.int64)
         sizes = (self._steps + 1) ** 2
         self._first = np.cumsum(sizes) - sizes
         self._light = np.zeros((int(sizes.sum()), 3), dtype=np.float32)

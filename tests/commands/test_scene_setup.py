@@ -162,7 +162,8 @@ def test_another_source_of_masks_is_asked_and_its_change_makes_them_anew(posed, 
     found = {"isnet-general-use": 90, "birefnet-general": 180}
     monkeypatch.setattr(
         "beags_plugin.masks.sources.rembg.load",
-        lambda model: asked.append(model) or (lambda photo: photo[..., 0] > found[model]),  # to check, and to make
+        # The source asks twice: to check, and to make.
+        lambda model: asked.append(model) or (lambda photo: photo[..., 0] > found[model]),
     )
 
     def run(*options: str) -> set[str]:

@@ -21,7 +21,7 @@ from beags_benchmarks.experiments.results import MEAN
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.whole_files import write_text_atomically
 
-ROOT = Path(__file__).resolve().parents[3]  # of a clone, whose pages are written
+ROOT = Path(__file__).resolve().parents[3]  # The pages of this clone are written.
 END = "<!-- end of the table -->\n"
 MOST_ROWS = 8
 
