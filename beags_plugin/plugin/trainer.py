@@ -266,7 +266,7 @@ class BeagsTrainer(Trainer):
 
     def stop_if_asked(self, step: int) -> None:
         """Save the step before ``step`` and end, if a signal asked for that or memory is running out."""
-        if self._interrupts.asked is not None:
+        if self._interrupts.signal is not None:
             if step > self._start_step:
                 self._save_once(step - 1)
             raise KeyboardInterrupt
@@ -284,7 +284,7 @@ class BeagsTrainer(Trainer):
             self._save_once(step)
         self._interrupts.at_once = True
         try:
-            if self._interrupts.asked is not None:
+            if self._interrupts.signal is not None:
                 raise KeyboardInterrupt
             yield
         finally:

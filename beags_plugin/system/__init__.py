@@ -1,1 +1,1 @@
-"""Errors, files, processes and devices: what knows nothing of scenes."""
+"""Errors, files, processes and devices: modules that know nothing of scenes."""

@@ -1,7 +1,7 @@
-"""Processes that end with the one that started them, however that ends (Linux; elsewhere nothing is done).
+"""Child processes that end with their parent, also when the parent is killed (Linux; elsewhere nothing is done).
 
-``python system/child_processes.py PARENT SIGNAL COMMAND...`` asks the kernel for the signal at the parent's end and
-becomes the command.
+``python system/child_processes.py PARENT SIGNAL COMMAND...`` asks the kernel to send the signal when the parent
+ends, and becomes the command.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def end_with_parent(kind: signal.Signals = signal.SIGTERM, parent: int | None = 
 
 
 def bound(command: Sequence[object], kind: signal.Signals = signal.SIGTERM) -> list[str]:
-    """Return a command line that does the same in a process that gets a signal when this thread ends."""
+    """Return a command line that runs ``command`` in a process that gets a signal when this thread ends."""
     words = [str(word) for word in command]
     if sys.platform != "linux":
         return words

@@ -1,4 +1,4 @@
-"""Digests that show whether something made earlier would come out the same again."""
+"""Digests of inputs: if they are unchanged, a result made from them earlier is still valid."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 _PACKAGE = Path(__file__).parents[1]
-_SHOWING = "commands"  # prints and draws what the rest has computed
+_SHOWING = "commands"  # this room only prints and draws what the rest has computed
 
 
 def code_digest(*more: Path) -> str:
@@ -24,10 +24,10 @@ def code_digest(*more: Path) -> str:
 
 
 def folder_digest(folder: Path, without: Path | None = None, names: Collection[str] = ()) -> str:
-    """Digest path, size and time of every file of ``folder`` whose name begins with no dot (as locks do).
+    """Digest path, size and time of every file of ``folder`` whose name has no leading dot, as those of locks have.
 
-    without: a folder whose content does not count, such as what was made of the files. names: of files and folders in
-    ``folder`` that do not count either.
+    without: a folder whose content does not count, such as results made from the files. names: names of files and
+    folders in ``folder`` that do not count either.
     """
     digest = hashlib.sha256(str(folder.resolve()).encode())
     left_out = None if without is None else without.resolve()

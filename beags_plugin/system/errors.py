@@ -1,4 +1,4 @@
-"""Errors that a user can repair, and errors of the system that become such."""
+"""Errors that a user can repair, and system errors that are turned into them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class UserError(Exception):
 def check_choice(name: str, choices: Iterable[str], kind: str, where: str = "", more: str = "") -> None:
     """Raise ``UserError`` unless ``name`` is one of the choices; the sentence names the nearest.
 
-    kind: the user's word for a choice ("preset"). where: stands after the name, more after the choices.
+    kind: the user's word for a choice ("preset"). where: text after the name. more: text after the choices.
     """
     if name in (choices := list(choices)):
         return
@@ -40,7 +40,7 @@ def check_choice(name: str, choices: Iterable[str], kind: str, where: str = "", 
 
 
 def meant(name: str, choices: Iterable[str]) -> str:
-    """Return the choice nearest to an unknown name, as a question in brackets; nothing if none is near."""
+    """Return the choice nearest to an unknown name, as a question in brackets; "" if none is near."""
     folded = {choice.casefold(): choice for choice in choices}
     near = get_close_matches(name.casefold(), folded, n=1, cutoff=0.75)
     return f" (did you mean {folded[near[0]]}?)" if near else ""
@@ -49,8 +49,8 @@ def meant(name: str, choices: Iterable[str]) -> str:
 def system_error(error: BaseException) -> OSError | None:
     """Return the operating system's error that caused ``error``, if there is one.
 
-    An error that was only raised while another one was handled has no such cause. torch's writer of files is the
-    exception: it cannot close a file whose disk is full, and reports that instead.
+    An error that is raised while a system error is handled is not caused by it. torch's writer of files is the
+    exception: when the disk is full, it reports that it cannot close the file.
     """
     at: BaseException | None = error
     seen: set[int] = set()
@@ -62,7 +62,7 @@ def system_error(error: BaseException) -> OSError | None:
 
 
 def is_of_disk(error: OSError) -> bool:
-    """Return whether a disk refused a write into an open file; other errors without a file are defects."""
+    """Return whether a disk refused a write into an open file; other errors that name no file are defects."""
     return error.errno in _OF_DISKS
 
 
@@ -77,8 +77,8 @@ def unwritable(path: str | Path, error: OSError) -> UserError:
 def writing(path: str | Path, what: str = "") -> Iterator[None]:
     """Turn the system's errors in the block into a ``UserError`` about ``path``, a file or the folder of many.
 
-    what: stands before the path in the sentence. Other errors pass: those of files elsewhere, as when one is read, and
-    those without a file, as of a closed pipe.
+    what: text before the path in the sentence. Other errors pass: errors of files elsewhere, such as an input that
+    cannot be read, and errors without a file, such as a closed pipe.
     """
     try:
         yield
@@ -92,7 +92,7 @@ def writing(path: str | Path, what: str = "") -> Iterator[None]:
 
 
 def _is_about(path: Path, error: OSError) -> bool:
-    """Return whether an error is of a file beside or below ``path``, or of a folder above, or of a disk unnamed."""
+    """Return whether an error names a file beside or below ``path`` or a folder above, or comes from a disk."""
     if isinstance(error.filename, (str, os.PathLike)):
         named = Path(error.filename).absolute()
         return named.is_relative_to(path.parent) or path.is_relative_to(named)
@@ -100,7 +100,7 @@ def _is_about(path: Path, error: OSError) -> bool:
 
 
 def refused(error: OSError) -> UserError | None:
-    """Return the error to print for one that no other handler caught; None if it names no file and no disk is full."""
+    """Return the message for a system error that nothing else caught; None if it names no file and no disk is full."""
     if error.filename is not None:
         return UserError(f"{error.filename} cannot be used ({error.strerror}): check that it is there and permitted.")
     if error.errno in _FULL:
@@ -109,9 +109,9 @@ def refused(error: OSError) -> UserError | None:
 
 
 def silence_libraries() -> None:
-    """Drop warnings that are meant for the authors of torch and nerfstudio, in programs that run beags alone.
+    """Hide warnings that are meant for the authors of torch and nerfstudio; for programs that run beags alone.
 
-    Warnings of other code are shown as before; so are all of them where ``python -W`` or PYTHONWARNINGS asks for some.
+    Warnings of other code stay. With ``python -W`` or PYTHONWARNINGS, all warnings stay.
     """
     if sys.warnoptions:
         return
@@ -123,9 +123,9 @@ def print_user_errors_plainly() -> None:
     """Print the sentence of an uncaught ``UserError`` instead of a traceback, in nerfstudio's programs.
 
     The program then ends with exit code 2. The thread that writes tensorboard's files prints nothing about a full
-    disk: it hands the error to whoever adds the next curve. Other exceptions are printed as before.
+    disk: it raises the error where the next curve is added. Other exceptions are printed as before.
 
-    Call this when something of ours is set up, not on import: it changes the process. A second call does nothing.
+    Call this when a part of beags is set up, not on import: it changes the process. A second call does nothing.
     """
     former = sys.excepthook
     if getattr(former, "prints_user_errors", False):
@@ -135,8 +135,7 @@ def print_user_errors_plainly() -> None:
         if isinstance(error, UserError):
             print(f"beags: {error}", file=sys.stderr)
             raise SystemExit(2)  # the interpreter would end with 1
-        else:
-            former(kind, error, traceback)
+        former(kind, error, traceback)
 
     hook.prints_user_errors = True  # type: ignore[attr-defined]
     sys.excepthook = hook

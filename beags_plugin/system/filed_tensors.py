@@ -1,4 +1,4 @@
-"""Tensors that lie in a file and are read back one at a time: they take no memory, however many there are."""
+"""Tensors that lie in a file and are read back one at a time, so that any number of them fits into memory."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from beags_plugin.system.reading.arrays import check_members, read_member
 
 
 class FiledTensors(Sequence[Tensor]):
-    """The tensors of a file that ``write_tensors`` wrote, in their order; each is read anew when it is asked for.
+    """The tensors of a file that ``write_tensors`` wrote, in their order; each access reads the file.
 
-    source: its path, or the file, open for reading, which is closed when this object goes.
+    source: its path, or the file open for reading, which is closed with this object.
     device: where the tensors are put.
     Raises ``OSError`` or ``ValueError`` for a file that is not there or not whole.
     """
@@ -32,13 +32,13 @@ class FiledTensors(Sequence[Tensor]):
         if not isinstance(source, Path):
             weakref.finalize(self, source.close)
         try:
-            self._held = zipfile.ZipFile(source)  # reads the list of what is there, and no more
+            self._archive = zipfile.ZipFile(source)  # reads the list of members only
             size = source.stat().st_size if isinstance(source, Path) else os.fstat(source.fileno()).st_size
-            check_members(self._held, size)
-            self._count = len(self._held.namelist())
+            check_members(self._archive, size)
+            self._count = len(self._archive.namelist())
         except (zipfile.BadZipFile, NotImplementedError) as error:
             raise ValueError(f"{source} holds no tensors: {error}") from None
-        weakref.finalize(self, self._held.close)
+        weakref.finalize(self, self._archive.close)
         self.device = torch.device(device)
 
     def __len__(self) -> int:
@@ -51,8 +51,8 @@ class FiledTensors(Sequence[Tensor]):
 
     def _read(self, index: int) -> Tensor:
         try:
-            return torch.from_numpy(read_member(self._held, self._held.getinfo(f"{index}.npy"))).to(self.device)
-        # what zipfile raises for members that are damaged, and torch for numbers that it does not know
+            return torch.from_numpy(read_member(self._archive, self._archive.getinfo(f"{index}.npy"))).to(self.device)
+        # zipfile raises these for damaged members, torch for types of numbers that it does not know
         except (zipfile.BadZipFile, NotImplementedError, RuntimeError, KeyError, TypeError, EOFError) as error:
             raise ValueError(f"tensor {index} cannot be read: {error}") from None
 
@@ -67,16 +67,16 @@ def write_tensors(file: BinaryIO, tensors: Iterable[Tensor]) -> None:
 
 
 def filed(tensors: Iterable[Tensor], device: torch.device | str = "cpu") -> FiledTensors:
-    """Move tensors to a temporary file as they come; it goes with the last reference to what is returned.
+    """Move tensors to a temporary file as they come; it is deleted with the last reference to the result.
 
     Raises ``UserError`` if the folder of temporary files is full.
     """
-    file = tempfile.TemporaryFile(prefix="beags-")  # noqa: SIM115  (closed with what is returned)
+    file = tempfile.TemporaryFile(prefix="beags-")  # noqa: SIM115  (closed with the result)
     try:
         write_tensors(file, tensors)
         file.flush()
     except OSError as error:
-        with suppress(OSError):  # it writes what it still holds, which fails again
+        with suppress(OSError):  # closing writes the rest of the buffer, which fails again
             file.close()
         if error.errno != errno.ENOSPC:
             raise

@@ -1,4 +1,4 @@
-"""Early ends of a training: Ctrl-C and SIGTERM, after the step is finished and saved; user errors."""
+"""Early ends of a training: after Ctrl-C or SIGTERM, once the step is finished and saved, and after user errors."""
 
 from __future__ import annotations
 
@@ -13,25 +13,23 @@ from rich.markup import escape
 
 from beags_plugin.system.errors import UserError
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
 
 class Interrupts:
-    """Notes the first signal for the training loop to ask about; a second one ends the program at once.
+    """Records the first signal in ``signal``, which the training loop reads; a second one ends the program at once.
 
-    at_once: let the first signal end the program too, as where no step could be finished. wake: called at the first
-    signal, so that a loop that waits looks at ``asked``.
+    at_once: let the first signal end the program too, where no step is running. wake: called at the first signal, so
+    that a waiting loop reads ``signal``.
     """
 
-    def __init__(self, wake: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, wake: Callable[[], None]) -> None:
         self._wake = wake
-        self.asked: int | None = None
+        self.signal: int | None = None
         self.at_once = False
         self._former: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Interrupts:
-        if threading.current_thread() is threading.main_thread():  # Python allows it there alone
-            self._former = {number: signal.signal(number, self._note) for number in SIGNALS}
+        if threading.current_thread() is threading.main_thread():  # Python sets handlers in this thread only
+            self._former = {number: signal.signal(number, self._note) for number in (signal.SIGINT, signal.SIGTERM)}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -40,7 +38,7 @@ class Interrupts:
         self._former = {}
 
     def _note(self, number: int, _: FrameType | None) -> None:
-        again, self.asked = self.asked is not None, number
+        again, self.signal = self.signal is not None, number
         if again or self.at_once:
             raise KeyboardInterrupt
         get_console().print("Stopping after this step, and saving it. Once more ends at once.", highlight=False)
@@ -49,11 +47,11 @@ class Interrupts:
     @property
     def exit_code(self) -> int:
         """Return the exit code that a shell expects of a program that a signal ended."""
-        return 128 + (self.asked or signal.SIGINT)
+        return 128 + (self.signal or signal.SIGINT)
 
 
 def stop(error: UserError) -> NoReturn:
-    """End the program with the sentence of a user's error, and exit code 2."""
+    """Print the sentence of a user error and end the program with exit code 2."""
     get_console().print(f"[bold red]beags:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
     error.reported = True
-    raise SystemExit(2) from error  # the cause is for callers from Python
+    raise SystemExit(2) from error  # callers from Python read the cause

@@ -1,4 +1,4 @@
-"""One process at a time in a folder: a training in its run's, beags process in its scene's."""
+"""Locks that let one process at a time work in a folder: a training in its run, ``beags process`` in its scene."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from filelock import BaseFileLock, FileLock, Timeout
 from beags_plugin.system.errors import UserError, writing
 
 LOCK = ".lock"
-"""File of a folder, locked by the process that works there; the file alone means nothing."""
+"""Name of the file that the process working in a folder locks; a file that nobody locks means nothing."""
 
-_held: WeakValueDictionary[Path, BaseFileLock] = WeakValueDictionary()  # by this process
+_held: WeakValueDictionary[Path, BaseFileLock] = WeakValueDictionary()  # locks that this process holds
 _ahead: dict[Path, BaseFileLock] = {}
 
 
 def lock_ahead(run: Path) -> None:
-    """Hold ``run`` for a training of this process, which may have yet to begin; ``run_lock`` takes the lock over.
+    """Lock ``run`` for a training of this process that has not begun yet; ``run_lock`` takes the lock over.
 
     Raises ``UserError`` if another process holds it.
     """
@@ -27,10 +27,10 @@ def lock_ahead(run: Path) -> None:
 
 
 def run_lock(run: Path, doing: str = "being trained") -> BaseFileLock:
-    """Hold a run's folder until ``release()`` is called or the process ends, however it ends.
+    """Lock a run's folder until ``release()`` is called or the process ends.
 
-    doing: says what another process does with it. Raises ``UserError`` if one holds it. Holds nothing where the system
-    or the disk has no such locks.
+    doing: what another process does with the folder, for the sentence. Raises ``UserError`` if one holds the lock.
+    Locks nothing where the system or the disk has no such locks.
     """
     if (lock := _ahead.pop(run.absolute(), None)) is not None:
         return lock
@@ -42,7 +42,7 @@ def run_lock(run: Path, doing: str = "being trained") -> BaseFileLock:
         except Timeout:
             raise UserError(f"{run} is {doing} by another process: wait for it, or end it first.") from None
         except OSError as error:
-            if error.filename is not None:  # the file cannot be opened; without a name: some network disks
+            if error.filename is not None:  # a named file cannot be opened; some network disks raise without a name
                 raise
     _held[run.absolute()] = lock
     return lock

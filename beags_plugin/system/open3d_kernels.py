@@ -1,4 +1,4 @@
-"""Open3D's compiled kernels without the rest of the package, which imports scikit-learn and Dash: we need neither."""
+"""Open3D's compiled kernels without the rest of its package, which imports scikit-learn and Dash."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 def open3d_kernels() -> Any:
     """Return the module with Open3D's ``core``, ``geometry``, ``t`` and ``utility``, on the CPU.
 
-    It saves about 2 seconds of CPU, three quarters of the import. The whole package can be imported later all the same.
+    This saves about 2 seconds of CPU, three quarters of the import. The whole package can still be imported later.
     Raises ``ImportError`` or ``OSError`` where Open3D, or a system library that it needs, is missing.
     """
     known = sys.modules.get("open3d.cpu.pybind")
@@ -19,10 +19,10 @@ def open3d_kernels() -> Any:
         return known
     spec = None if "open3d" in sys.modules else find_spec("open3d")
     if spec is None or spec.submodule_search_locations is None or sys.platform != "linux":
-        import open3d  # elsewhere the package prepares what its libraries need
+        import open3d  # on other systems the package prepares what its libraries need
 
         return open3d
-    package = ModuleType("open3d")  # stands for the package while the kernels are loaded
+    package = ModuleType("open3d")  # takes the place of the package while the kernels are loaded
     package.__path__ = list(spec.submodule_search_locations)
     sys.modules["open3d"] = package
     try:

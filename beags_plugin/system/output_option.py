@@ -1,4 +1,4 @@
-"""The option that says where results go: every command takes both of its names."""
+"""The option for the folder or file of results; every command takes both of its names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands in messages, quoted so that a shell takes them as they are printed."""
+"""Commands in messages, quoted so that they can be pasted into a shell."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def quoted(word: str | Path) -> str:
-    """Return a word of a command, in quotes where it holds spaces, brackets or else what a shell takes for its own."""
+    """Return a word of a command, in quotes if it holds spaces, brackets or others that a shell interprets."""
     return shlex.quote(str(word))
 
 

@@ -1,4 +1,4 @@
-"""The command line of the program that runs: nerfstudio's programs tell our code little more."""
+"""The command line of the running program, for what nerfstudio's programs do not pass on to plugins."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def program_name() -> str:
 
 
 def path_option(name: str) -> Path | None:
-    """Return the path that this program's command line gives an option, spelt with - or _; None where it does not."""
+    """Return the path that this program's command line gives an option, spelt with - or _; None without the option."""
     words = sys.argv[1:]
     for index, word in enumerate(words):
         option, equals, value = word.partition("=")

@@ -1,4 +1,4 @@
-"""A progress bar with the time left, for every stage that takes longer than a moment."""
+"""Progress bars with the time left."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import TypeVar
 from rich import get_console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-A_MOMENT = 2.0  # seconds
+A_MOMENT = 2.0  # seconds before a passing bar is shown
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
-"""Shows a progress bar of that name, as ``progress_bar`` does."""
+"""Shows a progress bar under a name, as ``progress_bar`` does."""
 
 
 @contextmanager
 def progress_bar(name: str, passing: bool = False) -> Iterator[Callable[[int, int], None]]:
     """Show a bar called ``name``; yields a callback that takes (done, total).
 
-    passing: show the bar only if the work takes longer than a moment, and remove it at the end.
+    passing: show the bar only once the work has taken ``A_MOMENT``, and remove it at the end.
     """
     columns = (
         TextColumn("  {task.description:<22}"),
@@ -44,7 +44,7 @@ def progress_bar(name: str, passing: bool = False) -> Iterator[Callable[[int, in
     try:
         yield update
     except BaseException:
-        progress.live.transient = True  # an error's message is enough
+        progress.live.transient = True  # the bar makes way for the error message
         raise
     finally:
         if progress.live.transient:
@@ -54,12 +54,12 @@ def progress_bar(name: str, passing: bool = False) -> Iterator[Callable[[int, in
 
 
 def say(message: str) -> None:
-    """Print a line as it is, above the bar if one is shown: on the console that bars use."""
+    """Print a line on the console of the bars, so that it appears above a bar; no markup is read."""
     get_console().print(message, highlight=False, markup=False, soft_wrap=True)
 
 
 def counted(items: Iterable[Item], total: int, progress: Callable[[int, int], None]) -> Iterator[Item]:
-    """Yield the items; call ``progress`` with (done, total) when the next one is asked for."""
+    """Yield the items; call ``progress`` with (done, total) when the next one is requested."""
     for done, item in enumerate(items, start=1):
         yield item
         progress(done, total)
@@ -68,7 +68,7 @@ def counted(items: Iterable[Item], total: int, progress: Callable[[int, int], No
 def each_view(
     count: int, work: Callable[[int], Result], progress: Callable[[int, int], None] | None = None
 ) -> Iterator[Result]:
-    """Yield ``work(0)``, .., ``work(count - 1)``, one after the other, as they are asked for.
+    """Yield ``work(0)``, .., ``work(count - 1)``, one after the other, as they are requested.
 
     progress: called with (done, count).
     """

@@ -17,11 +17,11 @@ def load(spec: str) -> Any:
 
 
 class Registry:
-    """Names mapped to ``"module:attribute"`` specs; a spec is imported only when it is asked for.
+    """Names mapped to ``"module:attribute"`` specs; a spec is imported only by ``get``.
 
     kind: the user's word for an entry ("rasterizer"). group: the entry-point group in which other packages add their
-    own, e.g. ``beags.rasterizers``. builtin: name to spec of this package's own; an entry point of the same name is
-    refused. elsewhere: name to the command that installs the distribution which has it.
+    own, e.g. ``beags.rasterizers``. builtin: name to spec of the entries of this package; an entry point of the same
+    name is refused. elsewhere: name to the command that installs the distribution with that entry.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Registry:
         return sorted(self._specs)
 
     def check(self, name: str, *besides: str) -> None:
-        """Raise ``UserError`` unless ``name`` is registered, or one of the words ``besides``; imports nothing."""
+        """Raise ``UserError`` unless ``name`` is registered, or is one of ``besides``; imports nothing."""
         if name in self._elsewhere and name not in self.names():
             raise UserError(
                 f"the {self.kind} {name!r} is not part of beags itself: run {self._elsewhere[name]} in a clone of it."

@@ -1,4 +1,4 @@
-"""Folders of TOML files that ship with the package, and reading such a file."""
+"""Folders of TOML files that ship with the package, and a reader of such files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def shipped_folder(name: str) -> Path:
-    """Return the folder ``name`` (method_configs) in the installed package, or beside it in a checkout."""
+    """Return the folder ``name``, such as method_configs, in the installed package, or beside it in a checkout."""
     installed = _PACKAGE / name
     return installed if installed.is_dir() else _PACKAGE.parent / name
 
@@ -23,7 +23,7 @@ def shipped_names(folder: str) -> list[str]:
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
-    """Read a TOML file; raises ``UserError`` if it cannot be read. what: for the sentence, e.g. "preset"."""
+    """Read a TOML file; raises ``UserError`` if it cannot be read. what: the user's word for the file ("preset")."""
     try:
         return load_toml(path)
     except OSError as error:

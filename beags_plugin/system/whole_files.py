@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, whenever the program is killed."""
+"""Files that are written whole or not at all, even if the program is killed."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import Any, BinaryIO
 from beags_plugin.system.errors import writing
 
 PART = ".part"
-"""Ends the names of files that are being written; their names start with a dot."""
+"""End of the names of unfinished files; these names also start with a dot."""
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], Any], beside: Path | None = None) -> None:
-    """Let ``write`` write a file that takes the place of ``path`` once it is safe on disk.
+    """Let ``write`` write a file, and move it to ``path`` once it is safe on disk.
 
-    beside: folder of the unfinished file, on the same disk; that of ``path`` if None. Raises ``UserError`` if the
-    system does not let it: the disk is full, or nothing may be written there.
+    beside: folder of the unfinished file, on the same disk; the folder of ``path`` if None. Raises ``UserError`` if the
+    disk is full or the folder may not be written to.
     """
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -30,7 +30,7 @@ def write_whole(path: Path, write: Callable[[BinaryIO], Any], beside: Path | Non
             put_in_place(part, path)
         except (Exception, KeyboardInterrupt):
             with suppress(OSError):
-                part.unlink(missing_ok=True)  # it may be what fills the disk
+                part.unlink(missing_ok=True)  # the unfinished file may be what fills the disk
             raise
 
 
@@ -40,12 +40,12 @@ def write_text_atomically(text: str, path: Path) -> None:
 
 
 def unfinished(path: Path, beside: Path | None = None) -> Path:
-    """Return the path where ``path`` is written first; beside: see ``write_whole``."""
+    """Return where the unfinished file for ``path`` is written; beside: see ``write_whole``."""
     return (beside or path.parent) / f".{path.name}{PART}"
 
 
 def put_in_place(part: Path, path: Path) -> None:
-    """Bring a file that has been written safely to disk, and let it take the place of ``path``."""
+    """Flush a written file to disk and move it to ``path``."""
     with open(part, "rb+") as file:
         os.fsync(file.fileno())
     os.replace(part, path)
@@ -55,30 +55,28 @@ def put_in_place(part: Path, path: Path) -> None:
 def remove_unfinished(
     folder: Path, below: bool = True, older: float = 0.0, ends: tuple[str, ...] = ("",)
 ) -> list[Path]:
-    """Remove what a killed program left half written in ``folder``, and with ``below`` in the folders below it.
+    """Remove unfinished files of killed programs from ``folder``, with ``below`` also from the folders below it.
 
-    older: only files to which nothing was written for so many seconds, where another process may be writing; 0: all.
-    ends: how the names of the whole files end, where other programs may write too. Returns the files.
+    older: seconds without a write after which a file counts as unfinished, for folders where another process may be
+    writing; 0 removes all. ends: only files whose finished names end so, for folders that other programs use too.
+    Returns the removed files.
     """
-    latest, found = time.time() - older, []
+    latest, removed = time.time() - older, []
     for path in sorted((folder.rglob if below else folder.glob)(f".*{PART}")):
-        with suppress(FileNotFoundError):  # another process has put it in its place
+        with suppress(FileNotFoundError):  # another process has finished it
             named = path.name.removesuffix(PART).endswith(ends)
             if named and path.is_file() and (not older or path.stat().st_mtime <= latest):
                 path.unlink()
-                found.append(path)
-    return found
+                removed.append(path)
+    return removed
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make a new name in ``folder`` survive a power cut; not every system can."""
+    """Make a new name in ``folder`` survive a power cut, where the system can."""
     try:
         handle = os.open(folder, os.O_RDONLY)
     except OSError:  # Windows opens no folders
         return
-    try:
+    with suppress(OSError):
         os.fsync(handle)
-    except OSError:
-        pass
-    finally:
-        os.close(handle)
+    os.close(handle)

@@ -1,4 +1,4 @@
-"""The library of zstd, which Python has had of its own only since 3.14."""
+"""The zstd library, which is a part of Python only since 3.14."""
 
 from __future__ import annotations
 

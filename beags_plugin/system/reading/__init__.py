@@ -1,1 +1,1 @@
-"""Reading files of any origin: nothing in them runs, and the sizes that they state are checked first."""
+"""Readers of untrusted files: nothing in a file is executed, and the sizes that it states are checked first."""

@@ -1,12 +1,12 @@
-"""Colours of points as bytes, from whatever numbers a program wrote them in."""
+"""Colours of points as bytes, from any of the number ranges that programs write."""
 
 from __future__ import annotations
 
 import numpy as np
 
 GREY = 128
-SH_BAND_0 = 0.28209479177387814  # of the constant spherical harmonic: 3DGS's colours are 0.5 + this times f_dc
-_MOST = 0.99  # share of numbers that tell their range; a few may lie beyond it
+SH_BAND_0 = 0.28209479177387814  # constant spherical harmonic: a 3DGS colour is 0.5 + this times f_dc
+_MOST = 0.99  # share of the numbers that decide on the range; a few may lie outside it
 _NAMES = (
     ("red", "green", "blue"),
     ("diffuse_red", "diffuse_green", "diffuse_blue"),
@@ -16,9 +16,9 @@ _NAMES = (
 
 
 def colors_of(table: np.ndarray) -> np.ndarray:
-    """Return the colours [N, 3] uint8 of points in a structured array; mid-grey where it has none that can be read.
+    """Return the colours [N, 3] uint8 of points in a structured array; mid-grey if it has none that can be read.
 
-    Columns red, green, blue of other names and f_dc_0..2 of splats count too; see ``as_bytes``.
+    The columns are red, green, blue, their other names in ``_NAMES``, or f_dc_0..2 of splats; see ``as_bytes``.
     """
     columns = {name.casefold(): name for name in table.dtype.names or ()}
     for names in _NAMES:
@@ -32,10 +32,10 @@ def colors_of(table: np.ndarray) -> np.ndarray:
 
 
 def as_bytes(colors: np.ndarray) -> np.ndarray:
-    """Return colours [N, 3] of any type as uint8, by the type and the range, as viewers take them.
+    """Return colours [N, 3] of any type as uint8; type and range decide on the scale, as in viewers.
 
-    One byte is a byte. Wider integers are bytes up to 255, else 16 bits. Floats are shares of 1, bytes up to 255, or
-    16 bits. Mid-grey where a colour is no number, and for all if the numbers fit none of these.
+    One-byte integers are bytes. Wider integers up to 255 are bytes, larger ones 16 bits. Floats are shares of 1, bytes
+    up to 255, or 16 bits. A colour that is no number is mid-grey; so are all if the numbers fit none of these ranges.
     """
     if colors.dtype.itemsize == 1:
         return np.ascontiguousarray(colors).view(np.uint8).reshape(colors.shape)
@@ -48,10 +48,7 @@ def as_bytes(colors: np.ndarray) -> np.ndarray:
 
 
 def range_of(colors: np.ndarray) -> tuple[np.ndarray, float | None]:
-    """Return colours [N, C] as float64, and the number that stands for 1; None if they fit no range, or none is there.
-
-    See ``as_bytes``.
-    """
+    """Return colours [N, C] as float64, and the number that stands for 1 (None without a range, see ``as_bytes``)."""
     whole = colors.dtype.kind in "iu"
     values = (colors.view(np.uint8) if colors.dtype.kind == "i" and colors.dtype.itemsize == 1 else colors).astype(
         np.float64
@@ -59,7 +56,7 @@ def range_of(colors: np.ndarray) -> tuple[np.ndarray, float | None]:
     if colors.dtype.itemsize == 1:
         return values, 255.0
     if whole and colors.dtype.itemsize == 2:
-        values[values < 0] += 65536  # 16 bits that lack the word unsigned
+        values[values < 0] += 65536  # 16 bits whose type should be unsigned
     known = np.isfinite(values).all(axis=1)
     if not known.any():
         return values, None

@@ -1,4 +1,4 @@
-"""Images: of a few kinds only, and of no more pixels than a large photograph."""
+"""Reader of images: a few formats only, and no more pixels than a large photograph has."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")
-"""Of Pillow's, those that photos and masks have; some of the others start programs to be drawn."""
+"""Pillow's formats that photos and masks have; for some of the others Pillow starts programs."""
 MOST_PIXELS = 178_956_970
-"""Of an image; Pillow's own bound, of half a gigabyte of colours."""
+"""Pillow's own limit: half a gigabyte of colours."""
 
 T = TypeVar("T")
 
 
 def read_image(path: Path | str, read: Callable[[Image], T], what: str = "the image", remedy: str = "replace it") -> T:
-    """Open an image and return what ``read`` makes of it.
+    """Open an image and return ``read(image)``.
 
-    what, remedy: what the sentence calls it, and what to do. Raises ``UserError`` if the file is missing, no such
-    image, cut off, or of too many pixels.
+    what: the user's word for the image. remedy: what to do. Raises ``FileNotFoundError``, and ``UserError`` if the file
+    is no such image, is cut off or has too many pixels.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -35,7 +35,7 @@ def read_image(path: Path | str, read: Callable[[Image], T], what: str = "the im
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # from half as many pixels on
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # Pillow warns from half as many pixels on
             image = Image.open(path, formats=FORMATS)
         with image:
             width, height = image.size
@@ -50,5 +50,5 @@ def read_image(path: Path | str, read: Callable[[Image], T], what: str = "the im
         raise broken(f"it is none of {', '.join(FORMATS)}", error) from error
     except Image.DecompressionBombError as error:
         raise broken(f"it promises more than {MOST_PIXELS:,} pixels", error) from error
-    except Exception as error:  # Pillow lets through whatever the readers of single formats raise
+    except Exception as error:  # Pillow passes on all errors of the readers of single formats
         raise broken(reason(error), error) from error

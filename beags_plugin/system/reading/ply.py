@@ -1,6 +1,6 @@
-"""Vertices of .ply files: read from text or binary of either byte order, and written as binary.
+"""Vertices of .ply files: read from text or binary of either byte order, written as binary.
 
-The size that a header promises is checked before anything of that size is made.
+The size that a header states is checked before anything of that size is allocated.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from beags_plugin.system.reading.colors import colors_of
 from beags_plugin.system.reading.stand_ins import stand_in, starts_as
 from beags_plugin.system.reading.text import number_of, reason
 
-_HEADER_BYTES = 1 << 20  # a header is longer than this in no file that is one
+_HEADER_BYTES = 1 << 20  # no real header is longer
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -29,7 +29,7 @@ _NAMES |= {"f4": "float", "f8": "double"}
 
 @dataclass(frozen=True)
 class _Property:
-    """A column of an element; length: the type of each list's length, None for a single number."""
+    """A column of an element. length: the type of a list's length; None for single numbers."""
 
     name: str
     type: str
@@ -46,13 +46,13 @@ class _Element:
         return any(column.length is not None for column in self.properties)
 
     def numbers(self, order: str) -> np.dtype:
-        """Return the columns of single numbers, one after the other."""
+        """Return the type of a row without its lists."""
         return np.dtype([(column.name, order + column.type) for column in self.properties if column.length is None])
 
 
 @dataclass(frozen=True)
 class _Header:
-    """order: of bytes, empty for text. body: the offset of the first byte after the header."""
+    """order: byte order, "" for text. body: offset of the first byte after the header."""
 
     order: str
     elements: list[_Element]
@@ -60,15 +60,15 @@ class _Header:
 
 
 def read_vertices(path: Path) -> np.ndarray:
-    """Read the element ``vertex`` of a .ply as a structured array; columns of lists are left out.
+    """Read the element ``vertex`` of a .ply as a structured array; columns of lists are dropped.
 
     The array of a binary file may be a read-only view of the file. Raises ``OSError`` if the file cannot be read,
     ``UserError`` if it is shorter than its header says, and ``ValueError`` with the reason if it is no .ply.
     """
-    found = read_element(path, "vertex")
-    if found is None:
+    vertices = read_element(path, "vertex")
+    if vertices is None:
         raise ValueError("'vertex' is missing")
-    return found
+    return vertices
 
 
 def read_element(path: Path, name: str) -> np.ndarray | None:
@@ -109,7 +109,7 @@ def write_vertices(file: BinaryIO, table: np.ndarray, comment: str = "") -> None
 def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read positions [N, 3] float64 and colours [N, 3] uint8 (mid-grey if there are none) of a .ply's vertices.
 
-    Positions are as they are, finite or not. Raises ``UserError`` if the file is absent or has no x, y, z.
+    Positions may be infinite or nan. Raises ``UserError`` if the file is absent or has no x, y, z.
     """
     if not path.is_file():
         raise UserError(f"the seed points {path} (ply_file_path) do not exist: restore the file or remove the key.")
@@ -128,11 +128,11 @@ def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check_size(path: Path, header: _Header) -> None:
-    """Raise ``UserError`` if what the header promises does not fit into the file."""
+    """Raise ``UserError`` if the elements of the header do not fit into the file."""
     promised = 0
     for element in header.elements:
         for column in element.properties:
-            # of a list at least its length is there; in text, a digit and what parts it from the next
+            # A list takes at least its length; a number in text takes a digit and a separator.
             promised += element.count * (int((column.length or column.type)[1]) if header.order else 2)
     rest = path.stat().st_size - header.body
     if promised > rest + (0 if header.order else 1):  # text may end without a line feed
@@ -206,7 +206,7 @@ def _from_text(path: Path, header: _Header, before: list[_Element], element: _El
 
 
 def _rows(file: BinaryIO, element: _Element, order: str) -> np.ndarray:
-    """Read an element with lists, of which each row has a length of its own, and drop the lists."""
+    """Read an element whose rows have different lengths because of lists, and drop the lists."""
     table = np.empty(element.count, element.numbers(order))
     for row in range(element.count):
         for column in element.properties:

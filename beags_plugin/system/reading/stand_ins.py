@@ -1,4 +1,4 @@
-"""Files that stand in place of data: pointers of Git LFS and git-annex, web pages, files without bytes or misnamed."""
+"""Files that are not the data their names promise: Git LFS or git-annex pointers, web pages, empty or misnamed."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ from pathlib import Path
 
 from beags_plugin.system.pasted import quoted
 
-_HEAD = 2048  # bytes that tell; a pointer of Git LFS has fewer than 1024
+_HEAD = 2048  # bytes to look at; a Git LFS pointer has fewer than 1024
 _LFS = b"version https://git-lfs.github.com/spec/"
 _ANNEX = re.compile(rb"^(?:\.\./|/)*\.?git/annex/objects/|^/annex/objects/")
-_XML = re.compile(rb"^\s*<\?xml[^>]*\?>\s*<(?:Error|Code)\b")  # what storage services answer in place of a file
+_XML = re.compile(rb"^\s*<\?xml[^>]*\?>\s*<(?:Error|Code)\b")  # error messages of storage services
 _PAGE = re.compile(rb"^\s*(?:<!--.*?-->\s*)*(?:<!doctype\s+html|<html\b|<head\b|<body\b)", re.IGNORECASE | re.DOTALL)
-
-
 _STARTS = (
     (b"ply\n", "a .ply"), (b"ply\r", "a .ply"), (b"PK\x03\x04", "a zip, as .sog and .usdz are"),
     (b"\x1f\x8b", "packed by gzip, as .spz is"), (b"glTF", "a .glb"), (b"#usda", "a .usda"), (b"PXR-USDC", "a .usdc"),
@@ -23,7 +21,7 @@ _STARTS = (
 
 
 def starts_as(path: Path) -> str | None:
-    """Return what the first bytes of a file say that it is, for the brackets of a sentence; None if they do not."""
+    """Return the format that the first bytes of a file show, for the brackets of a sentence; None if unknown."""
     try:
         with path.open("rb") as file:
             head = file.read(8)
@@ -33,9 +31,9 @@ def starts_as(path: Path) -> str | None:
 
 
 def stand_in(path: Path | str) -> str | None:
-    """Return what a file is in place of data, and the command or the remedy, for the brackets of a sentence.
+    """Return what a file without data is and the remedy, for the brackets of a sentence.
 
-    None for data, for what cannot be read, and for what is no file.
+    None for files with data, files that cannot be read, and paths that are no file.
     """
     path = Path(path)
     try:
@@ -45,17 +43,12 @@ def stand_in(path: Path | str) -> str | None:
             head = file.read(_HEAD)
     except OSError:
         return None
-    return of_bytes(head, path.name)
-
-
-def of_bytes(head: bytes, name: str) -> str | None:
-    """Return what ``stand_in`` does for the first bytes of a file called ``name``."""
     if not head:
         return "it is empty, as after a download that broke off; get it again"
     if head.startswith(_LFS):
         return "it is a pointer of Git LFS, not the file itself; run git lfs pull in its folder"
     if _ANNEX.match(head):
-        return f"it is a pointer of git-annex, not the file itself; run git annex get {quoted(name)} in its folder"
+        return f"it is a pointer of git-annex, not the file itself; run git annex get {quoted(path.name)} in its folder"
     if _PAGE.match(head.removeprefix(b"\xef\xbb\xbf")):
         return "it is a web page, not the file itself; open the link in a browser and download the file"
     if _XML.match(head):

@@ -1,4 +1,4 @@
-"""JSON, TOML and plain text as programs write them, with every failure as a ``ValueError``."""
+"""Readers of JSON, TOML and plain text that turn every failure of content into a ``ValueError``."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]  (installed on Python 3.10 only)
 
-_WIDE = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)  # editors and PowerShell of Windows write them
-# What other programs write into JSON: comments, a comma behind the last entry, and C's words for no number.
+_WIDE = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)  # editors and PowerShell on Windows write them
+# Other programs write these into JSON: comments, a comma after the last entry, and C's spellings of nan and infinity.
 _LOOSE = re.compile(
     r'(?P<text>"(?:[^"\\]|\\.)*")'
     r"|(?P<comment>//[^\n]*|/\*.*?\*/|^[ \t]*\#[^\n]*)"
@@ -41,12 +41,12 @@ def read_text(path: Path) -> str:
 def load_json(path: Path, object_pairs_hook: Callable[[list], Any] | None = None) -> Any:
     """Read a JSON file; raises ``OSError`` if it cannot be read, ``ValueError`` if it is no JSON.
 
-    Comments, a comma behind the last entry, and any spelling of NaN and Infinity are read too.
+    Comments, a comma after the last entry, and any spelling of NaN and Infinity are read too.
     """
     text = read_text(path)
 
     def parsed(given: str) -> Any:
-        return json.loads(given, object_pairs_hook=object_pairs_hook, strict=False)  # tabs within texts are read
+        return json.loads(given, object_pairs_hook=object_pairs_hook, strict=False)  # accepts tabs within strings
 
     try:
         return parsed(text)
@@ -65,7 +65,7 @@ def load_json(path: Path, object_pairs_hook: Callable[[list], Any] | None = None
 
 
 def _strict(part: re.Match[str]) -> str:
-    """Return what JSON has for a match of ``_LOOSE``; line ends stay, so that errors name the right line."""
+    """Return strict JSON for a match of ``_LOOSE``; line ends stay, so that errors name the right line."""
     if part["text"] is not None:
         return part["text"]
     if part["nan"] is not None:
@@ -76,14 +76,14 @@ def _strict(part: re.Match[str]) -> str:
 
 
 def number_of(word: str) -> float:
-    """Return the number that a word of a text file stands for, also C's words for none; raises ``ValueError``."""
+    """Return the number that a word of a file spells, also C's nan and infinity; raises ``ValueError`` for others."""
     try:
         return float(word)
     except ValueError:
-        found = _LOOSE.fullmatch(word)
-        if found is None or not (found["nan"] or found["endless"]):
+        match = _LOOSE.fullmatch(word)
+        if match is None or not (match["nan"] or match["endless"]):
             raise
-        return float(_strict(found).lower())
+        return float(_strict(match).lower())
 
 
 def load_toml(path: Path) -> dict[str, Any]:
