@@ -1,4 +1,4 @@
-"""Points on the surfaces of a scene, many more than features give: from depths on which several photos agree."""
+"""Dense points on the surfaces of a scene, from depths on which several photos agree."""
 
 from __future__ import annotations
 
@@ -10,15 +10,18 @@ import numpy as np
 
 from beags_plugin.posing.plane_sweep import PosedPhoto, SweptDepth, swept
 
-NEIGHBOURS = 5  # photos that a photo is compared with
-ANGLES = 4.0, 40.0  # degrees between the rays of neighbours: less tells no depth, more looks different
-USEFUL_ANGLE = 8.0  # degrees from which a wider angle makes no better neighbour
-LEAST_SHARED = 10  # points that both photos of a pair show
-NEARER, FARTHER = 0.6, 3.0  # Depths may exceed those of the known points by these factors.
-OTHERS = 12  # photos that a depth is verified in: those that share most
-AGREE = 2  # So many of them must have the same depth.
+NEIGHBOURS = 5  # photos that each photo is compared with
+ANGLES = (
+    4.0,
+    40.0,
+)  # degrees between the rays of neighbours: smaller ones give no depth, larger ones look different
+USEFUL_ANGLE = 8.0  # degrees beyond which a wider angle makes no better neighbour
+LEAST_SHARED = 10  # known points that both photos of a pair must show
+NEARER, FARTHER = 0.6, 3.0  # factors by which depths may exceed those of the known points
+OTHERS = 12  # photos in which a depth is verified, those that share most points
+AGREE = 2  # photos among these that must have the same depth
 WORKERS = 4  # threads at most; each takes 300 MB for a photo of 30,000 pixels
-STEPS, PIXELS = 1.5, 1.5  # between planes, and of a photo, by which depths that agree may differ
+STEPS, PIXELS = 1.5, 1.5  # plane distances, and pixels in the photo, by which agreeing depths may differ
 
 
 def dense_points(
@@ -28,12 +31,12 @@ def dense_points(
     count: int,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return about ``count`` points [N, 3] float32 on surfaces and their colours [N, 3] uint8; fewer where few agree.
+    """Return about ``count`` points [N, 3] float32 on surfaces and their colours [N, 3] uint8; fewer if few agree.
 
-    A photo's depths are those of ``plane_sweep.swept``; one counts where two more photos have the same. The points are
-    spread evenly as seen from the cameras: twice as far off they lie twice as far apart.
+    Depths come from ``plane_sweep.swept``; a depth counts if ``AGREE`` other photos have the same. The points are
+    evenly dense in the photos: at twice the distance they lie twice as far apart.
 
-    colors: [H, W, 3] uint8 of each photo. points: [P, 3] known before, world. progress: receives (done, total) photos.
+    colors: [H, W, 3] uint8 of each photo. points: [P, 3] known points, world. progress: receives (done, total) photos.
     """
     inside = np.array([photo.seen(points)[0] for photo in photos])
     shared = inside.astype(np.int64) @ inside.T.astype(np.int64)
@@ -50,16 +53,14 @@ def dense_points(
         for depth in pool.map(depth_of, range(len(photos))):
             depths.append(depth)
             progress(len(depths), len(photos))
-    found = [
-        _verified(index, photos, depths, np.argsort(-shared[index], kind="stable")) for index in range(len(photos))
-    ]
-    places = np.concatenate([place for place, _, _ in found])
-    seen = np.concatenate([color[at] for (_, at, _), color in zip(found, colors, strict=True)])
-    weights = np.concatenate([weight for _, _, weight in found])
-    distances = np.concatenate(
-        [np.linalg.norm(place - photo.center, axis=1) for (place, _, _), photo in zip(found, photos, strict=True)]
-    )
-    return _thinned(places, seen, weights, distances, count)
+    places, shades, weights, distances = [], [], [], []
+    for index, (photo, color) in enumerate(zip(photos, colors, strict=True)):
+        place, pixels, weight = _verified(index, photos, depths, np.argsort(-shared[index], kind="stable"))
+        places.append(place)
+        shades.append(color[pixels])
+        weights.append(weight)
+        distances.append(np.linalg.norm(place - photo.center, axis=1))
+    return _thinned(*map(np.concatenate, (places, shades, weights, distances)), count)
 
 
 def _neighbours(
@@ -82,7 +83,7 @@ def _neighbours(
 def _verified(
     index: int, photos: Sequence[PosedPhoto], depths: Sequence[SweptDepth | None], others: np.ndarray
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Return the points [N, 3] of a photo that others have too, their (rows, columns) and how many others, [N]."""
+    """Return the points [N, 3] of a photo that others confirm, their (rows, columns) and the number of others, [N]."""
     own = depths[index]
     if own is None:
         return np.zeros((0, 3)), (np.zeros(0, np.int64), np.zeros(0, np.int64)), np.zeros(0)
@@ -104,9 +105,9 @@ def _verified(
         close = np.linalg.norm(landed - xy[candidates], axis=1) < PIXELS
         agreed[candidates[close]] += 1
         total[candidates[close]] += 1.0 / own_z[close]
-    kept = agreed >= AGREE
-    mean = total[kept] / (agreed[kept] + 1)
-    return photos[index].lifted(xy[kept], mean), (rows[kept], columns[kept]), agreed[kept].astype(np.float64)
+    sure = agreed >= AGREE
+    mean = total[sure] / (agreed[sure] + 1)
+    return photos[index].lifted(xy[sure], mean), (rows[sure], columns[sure]), agreed[sure].astype(np.float64)
 
 
 def _thinned(
@@ -114,7 +115,7 @@ def _thinned(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return at most ``count`` weighted means of the points in cells that grow with the distance from a camera.
 
-    A cell of one point alone has none: several photos show what they agree on.
+    Cells with a single point are dropped: several photos should have put points there.
     """
     octave = np.floor(np.log2(np.maximum(distances, 1e-9))).astype(np.int64)
 

@@ -1,4 +1,4 @@
-"""Features of photos, in COLMAP's database: OpenCV's SIFT, which takes a quarter of COLMAP's own time on a CPU."""
+"""Features of photos in COLMAP's database, by OpenCV's SIFT: it takes a quarter of the time of COLMAP's on a CPU."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from beags_plugin.posing.photos import Look, Photo, look_at
 from beags_plugin.system.progress import counted
 from beags_plugin.system.reading.images import read_image
 
-MOST = 8192  # features of a photo
-LARGEST = 1200  # pixels on a side, to which photos are reduced to find features
-GUESS = 1.2  # focal length, in longest sides, of a photo that does not tell it
+MOST = 8192  # features per photo
+LARGEST = 1200  # pixels of the longer side to which photos are reduced for finding features
+GUESS = 1.2  # focal length, in longest sides, of a photo whose EXIF does not state it
 LENS = "SIMPLE_RADIAL"
-"""COLMAP's name of the lens while photos are added one by one; few parameters keep it from going astray."""
+"""COLMAP's lens model while photos are added one by one; few parameters keep the solution stable."""
 
 
 def add_features(database: Any, photos: Sequence[Photo], progress: Callable[[int, int], None]) -> list[Look]:
-    """Add photos and their features to a database, but those it holds; returns the look of every photo."""
+    """Add photos and their features to a database, except photos that it holds; returns the look of every photo."""
     import cv2
     import pycolmap
 
@@ -34,9 +34,12 @@ def add_features(database: Any, photos: Sequence[Photo], progress: Callable[[int
         looks.append(look_at(grey))
         if photo.key in known:
             continue
-        inside = None if photo.mask is None else _inside(read_id_mask(photo.mask, photo.ignore_ids))
+        inside = None
+        if photo.mask is not None:
+            ids = read_id_mask(photo.mask, photo.ignore_ids)
+            inside = np.uint8(255) * ((ids != BACKGROUND) & (ids != IGNORE))
         points, descriptors = _features(finder, grey, inside)
-        with pycolmap.DatabaseTransaction(database):  # a photo is there with its features, or not at all
+        with pycolmap.DatabaseTransaction(database):  # the database gets a photo together with its features
             if _lens_of(photo) not in cameras:
                 cameras[_lens_of(photo)] = _write_camera(database, photo)
             image_id = _write_image(database, photo.key, cameras[_lens_of(photo)])
@@ -46,7 +49,7 @@ def add_features(database: Any, photos: Sequence[Photo], progress: Callable[[int
 
 
 def forget(database: Any, photos: Sequence[Photo]) -> None:
-    """Give photos that have changed another name, under which nobody asks for their features and matches."""
+    """Rename photos that have changed in the database, so that their old features and matches are never used."""
     for photo in photos:
         if database.exists_image(photo.key):
             image = database.read_image_with_name(photo.key)
@@ -58,13 +61,8 @@ def _lens_of(photo: Photo) -> tuple[int, int, float | None]:
     return photo.width, photo.height, photo.focal
 
 
-def _inside(ids: np.ndarray) -> np.ndarray:
-    """Return [H, W] uint8, not 0 in the pixels of objects."""
-    return np.uint8(255) * ((ids != BACKGROUND) & (ids != IGNORE))
-
-
-def _features(finder: Any, grey: np.ndarray, inside: np.ndarray | None = None) -> tuple[np.ndarray, Any]:
-    """Return points [N, 4] float32 (x, y, scale, direction; 0.5 is a pixel's middle) and COLMAP's RootSIFT [N, 128].
+def _features(finder: Any, grey: np.ndarray, inside: np.ndarray | None) -> tuple[np.ndarray, Any]:
+    """Return points [N, 4] float32 (x, y, scale, direction; pixel centres at + 0.5) and COLMAP's RootSIFT [N, 128].
 
     inside: [H, W] uint8, 0 where no point may lie.
     """
@@ -75,10 +73,10 @@ def _features(finder: Any, grey: np.ndarray, inside: np.ndarray | None = None) -
     if factor < 1:
         grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
         inside = None if inside is None else cv2.resize(inside, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    found, raw = finder.detectAndCompute(grey, inside)
+    keypoints, raw = finder.detectAndCompute(grey, inside)
     if raw is None:
-        found, raw = (), np.zeros((0, 128), np.float32)
-    table = [(one.pt[0] + 0.5, one.pt[1] + 0.5, one.size / 2, np.deg2rad(one.angle)) for one in found]
+        keypoints, raw = (), np.zeros((0, 128), np.float32)
+    table = [(one.pt[0] + 0.5, one.pt[1] + 0.5, one.size / 2, np.deg2rad(one.angle)) for one in keypoints]
     points = np.array(table, np.float32).reshape(-1, 4)
     points[:, :3] /= factor
     roots = np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-9))
@@ -112,7 +110,7 @@ def _write_image(database: Any, name: str, camera_id: int) -> int:
 
 
 def coarse_descriptors(database: Any, image_id: int, count: int) -> np.ndarray:
-    """Return [count or fewer, 128] float32 of unit length: the features that small pictures still show."""
+    """Return [count or fewer, 128] float32 of unit length: the descriptors of the largest features."""
     points = database.read_keypoints(image_id)
     scales = points[:, 2] if points.shape[1] == 4 else np.zeros(len(points))
     largest = np.argsort(-scales, kind="stable")[:count]

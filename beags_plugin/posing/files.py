@@ -22,7 +22,7 @@ _LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
 def write_scene(folder: Path, model: Any) -> None:
-    """Write a reconstruction with OPENCV lenses; transforms.json comes last, so that it stands for all of them."""
+    """Write a reconstruction with OPENCV lenses; transforms.json is written last, so that it stands for all files."""
     with writing(folder):
         part = folder / MODEL.parent / ".0.part"
         shutil.rmtree(part, ignore_errors=True)
@@ -31,20 +31,16 @@ def write_scene(folder: Path, model: Any) -> None:
         shutil.rmtree(folder / MODEL, ignore_errors=True)
         part.rename(folder / MODEL)
     points = [model.points3D[key] for key in sorted(model.points3D)]
-    names = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    table = np.zeros(len(points), dtype=names)
     xyz = np.array([point.xyz for point in points]).reshape(-1, 3) @ APPLIED[:, :3].T
     rgb = np.array([point.color for point in points]).reshape(-1, 3)
-    for column, name in enumerate(("x", "y", "z")):
-        table[name] = xyz[:, column]
-    for column, name in enumerate(("red", "green", "blue")):
-        table[name] = rgb[:, column]
+    columns = [*((name, "<f4") for name in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
+    table = np.rec.fromarrays([*xyz.T, *rgb.T], dtype=columns)
     write_whole(folder / POINTS, lambda file: write_vertices(file, table))
     write_text_atomically(json.dumps(transforms(model), indent=1) + "\n", folder / TRANSFORMS)
 
 
 def transforms(model: Any) -> dict[str, Any]:
-    """Return nerfstudio's transforms.json: frames by name; lenses for all frames, or for each if there are several."""
+    """Return nerfstudio's transforms.json: frames by name, and one lens for all frames, or one each if they differ."""
     images = sorted((model.images[image_id] for image_id in model.reg_image_ids()), key=lambda image: image.name)
     lenses = {camera_id: _lens(model.cameras[camera_id]) for camera_id in {image.camera_id for image in images}}
     shared = next(iter(lenses.values())) if len(lenses) == 1 else {}
@@ -65,7 +61,7 @@ def transforms(model: Any) -> dict[str, Any]:
 
 
 def camera_to_world(image: Any) -> np.ndarray:
-    """Return [4, 4]: the pose of a placed photo in nerfstudio's world; its camera looks along -z, y is up."""
+    """Return the pose [4, 4] of a registered photo in nerfstudio's world; its camera looks along -z, y is up."""
     pose = np.eye(4)
     pose[:3] = image.cam_from_world().inverse().matrix()
     pose[:3] = APPLIED[:, :3] @ pose[:3]

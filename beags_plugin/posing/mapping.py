@@ -1,4 +1,4 @@
-"""Structure from motion on a database of features: matches of chosen pairs, poses, points, and lenses."""
+"""Structure from motion on a database of features: matches of chosen pairs, poses, points and lenses."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from urllib.parse import unquote
 import numpy as np
 
 SEED = 0
-AT_ONCE = 40  # pairs, between two looks at the progress
-SMALLEST = 3  # photos of a group that is worth a word
-ENOUGH = 6  # photos of a lens, for its distortion to be told from its poses
+AT_ONCE = 40  # pairs between two reports of progress
+SMALLEST = 3  # photos of a group that is reported
+ENOUGH = 6  # photos of a lens that determine its distortion
 FEWEST_POINTS = 15
-"""Of the scene, which a photo must show to be placed; with COLMAP's 30, sparse photos fall apart into groups."""
+"""Points that a photo must show to get a pose; with COLMAP's 30, sparse photos fall apart into groups."""
 LENS = "OPENCV"
-ROUNDS = 3  # of the last adjustment, each without the points that the one before has shown to be wrong
-MIDDLE_KNOWN = 0.03  # degrees of standard deviation, below which the middle of a lens is found by its photos
-MIDDLE_CLEAR = 30.0  # standard deviations from the middle of the photo, beyond which it is found too
+ROUNDS = 3  # rounds of the last adjustment; each drops the points that the one before has shown to be wrong
+MIDDLE_KNOWN = 0.03  # degrees of standard deviation below which the principal point counts as determined
+MIDDLE_CLEAR = 30.0  # standard deviations from the middle of the photo beyond which it counts too
 LARGEST_ERROR = 2.0  # pixels
 SMALLEST_ANGLE = 1.5  # degrees
 
@@ -28,7 +28,7 @@ SMALLEST_ANGLE = 1.5  # degrees
 def match(
     database: Path, keys: Sequence[str], pairs: Sequence[tuple[int, int]], progress: Callable[[int, int], None]
 ) -> None:
-    """Match the features of pairs of photos and keep what a camera's motion explains; skips pairs already matched."""
+    """Match the features of pairs and keep matches that a camera's motion explains; skips pairs already matched."""
     import pycolmap
 
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False)
@@ -45,9 +45,9 @@ def match(
 
 
 def place(database: Path, folder: Path, keys: Sequence[str], progress: Callable[[int, int], None]) -> list[Any]:
-    """Place photos one by one; returns pycolmap's reconstructions of unconnected groups, the largest first.
+    """Find poses photo by photo; returns pycolmap's reconstructions of unconnected groups, the largest first.
 
-    folder: for pycolmap to write. keys: of the photos to place; a database may hold others.
+    folder: scratch folder of pycolmap. keys: the photos to use; a database may hold others.
     """
     import pycolmap
 
@@ -64,20 +64,20 @@ def place(database: Path, folder: Path, keys: Sequence[str], progress: Callable[
         progress(done, total)
 
     pycolmap.set_random_seed(SEED)
-    found = pycolmap.incremental_mapping(database, folder, folder, options, next_image_callback=placed)
+    models = pycolmap.incremental_mapping(database, folder, folder, options, next_image_callback=placed)
     progress(total, total)
-    for model in found.values():
+    for model in models.values():
         for image in model.images.values():
             image.name = unquote(image.name)
-    return sorted(found.values(), key=lambda one: -one.num_reg_images())
+    return sorted(models.values(), key=lambda one: -one.num_reg_images())
 
 
 def refine(model: Any, progress: Callable[[int, int], None]) -> Any:
-    """Return the model with poses, points and lenses adjusted together, now with all distortion.
+    """Return the model with poses, points and lenses adjusted together, now with all parameters of distortion.
 
-    Few photos can hardly tell the middle of a lens from a turn of the camera: it leaves that of the photo only where it
-    is known (``MIDDLE_KNOWN``) or clearly elsewhere (``MIDDLE_CLEAR``). A lens with fewer than ``ENOUGH`` photos is
-    kept.
+    Few photos can hardly tell a shifted principal point from a turn of the camera. It therefore moves from the middle
+    of the photo only where it is well determined (``MIDDLE_KNOWN``) or clearly elsewhere (``MIDDLE_CLEAR``). A lens
+    with fewer than ``ENOUGH`` photos is not adjusted.
     """
     import pycolmap
 
@@ -103,7 +103,7 @@ def refine(model: Any, progress: Callable[[int, int], None]) -> Any:
 
 
 def _adjust(model: Any, constant: list[int], middle: bool) -> None:
-    """Adjust a model, but the lenses that are constant; middle: of the lenses too."""
+    """Adjust a model without the ``constant`` lenses; middle: also adjust principal points."""
     import pycolmap
 
     for _ in range(ROUNDS):
@@ -120,7 +120,7 @@ def _problem(model: Any, constant: list[int], middle: bool) -> Any:
     options = pycolmap.BundleAdjustmentOptions(refine_principal_point=middle, print_summary=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.loss_function_scale = 1.0  # pixel
-    options.ceres.solver_options.function_tolerance = 1e-6  # without it, hundreds of photos take minutes
+    options.ceres.solver_options.function_tolerance = 1e-6  # hundreds of photos take minutes otherwise
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
@@ -131,21 +131,21 @@ def _problem(model: Any, constant: list[int], middle: bool) -> Any:
 
 
 def _vague_middles(model: Any, few: list[int]) -> list[int]:
-    """Return the lenses, but those of few photos, whose middle the photos cannot tell."""
+    """Return the lenses, except those of few photos, whose principal point the photos do not determine."""
     import pycolmap
 
     problem = _problem(model, few, middle=True)
     covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, problem)
-    found = []
+    vague = []
     for camera_id in set(model.cameras) - set(few):
         camera = model.cameras[camera_id]
         own = None if covariance is None else covariance.get_other_params_cov(camera.params)
         if own is None:
-            found.append(camera_id)
+            vague.append(camera_id)
             continue
-        deviation = model.compute_mean_reprojection_error() * np.sqrt(np.diag(own)[2:4])  # of x and y, in pixels
+        deviation = model.compute_mean_reprojection_error() * np.sqrt(np.diag(own)[2:4])  # x and y, in pixels
         shift = np.abs(camera.params[2:4] - [camera.width / 2, camera.height / 2])
         known = deviation.max() < np.deg2rad(MIDDLE_KNOWN) * camera.mean_focal_length()
         if not known and (shift / deviation).max() < MIDDLE_CLEAR:
-            found.append(camera_id)
-    return found
+            vague.append(camera_id)
+    return vague

@@ -1,4 +1,4 @@
-"""Which photos to compare: those whose largest features look alike, and enough others that none is left alone."""
+"""Choice of the pairs of photos to match: photos that look alike, and enough others to connect all photos."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ import numpy as np
 
 from beags_plugin.system.progress import counted
 
-NEIGHBOURS = 16  # the photos most alike, with which each is compared
-IN_ORDER = 2  # and the next ones by name: people walk while they take photos
-ALL = 30  # photos, of which all pairs are compared: few photos are far apart, and each pair counts
-COARSE = 300  # features of a photo that are looked at first, the largest
-AT_ONCE = 16  # photos compared with one
-RATIO = 0.85  # of the distances to the nearest and the next nearest feature, at most
+NEIGHBOURS = 16  # most similar photos that each photo is compared with
+IN_ORDER = 2  # next photos by name that it is compared with too: people walk while they take photos
+ALL = 30  # photos up to which all pairs are compared: few photos are far apart, and each pair counts
+COARSE = 300  # largest features of a photo, by which likeness is measured
+AT_ONCE = 16  # photos compared with one in one step
+RATIO = 0.85  # largest ratio of the distances to the nearest and the next nearest feature
 
 
 def likeness(descriptors: Sequence[np.ndarray], progress: Callable[[int, int], None]) -> np.ndarray:
-    """Count the features [N, N] int64 that are each other's nearest, and clearly so, for each pair of photos.
+    """Return [N, N] int64: for each pair of photos, the features that are each other's nearest by a clear margin.
 
-    descriptors: of each photo [F, 128], of unit length.
+    descriptors: [F, 128] of each photo, of unit length.
     """
     count, most = len(descriptors), max(1, *map(len, descriptors))
-    table = np.zeros((count, most, 128), np.float32)  # what is missing is equally far from all
-    for rows, found in zip(table, descriptors, strict=True):
-        rows[: len(found)] = found
+    table = np.zeros((count, most, 128), np.float32)  # missing features are equally far from all
+    for rows, own in zip(table, descriptors, strict=True):
+        rows[: len(own)] = own
     alike = np.zeros((count, count), np.int64)
     for one in counted(range(count), count, progress):
         for first in range(one + 1, count, AT_ONCE):
             others = table[first : first + AT_ONCE]
             cosine = (table[one] @ others.reshape(-1, 128).T).reshape(most, -1, most)
-            nearest = cosine.argmax(2)  # of the other's features, for each of ours
+            nearest = cosine.argmax(2)  # the other photo's nearest feature to each of this one
             mutual = np.take_along_axis(cosine.argmax(0).T, nearest, 0) == np.arange(most)[:, None]
             best = cosine.max(2)
             np.put_along_axis(cosine, nearest[..., None], 0, 2)
@@ -42,8 +42,8 @@ def likeness(descriptors: Sequence[np.ndarray], progress: Callable[[int, int], N
 def choose_pairs(alike: np.ndarray) -> list[tuple[int, int]]:
     """Return the pairs (smaller, larger) to compare, in order.
 
-    They are all pairs of few photos; else the ``NEIGHBOURS`` most alike to each photo, the ``IN_ORDER`` next ones, and
-    the branches of the tree that connects all photos by the pairs most alike.
+    Up to ``ALL`` photos these are all pairs. Otherwise they are, for each photo, the ``NEIGHBOURS`` most similar ones
+    and the ``IN_ORDER`` next ones, and the edges of the tree that connects all photos by the most similar pairs.
     """
     from scipy.sparse.csgraph import minimum_spanning_tree
 

@@ -1,4 +1,4 @@
-"""The photos of a scene before they have poses: found, refused or copied upright, and looked at for what is wrong."""
+"""Photos of a scene before they have poses: listing, checks, upright copies, and signs of blur and repetition."""
 
 from __future__ import annotations
 
@@ -22,24 +22,25 @@ from beags_plugin.system.whole_files import write_whole
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-FEWEST = 3  # photos
+FEWEST = 3  # photos that a scene needs
 SIDE = 320
-"""Longest side of the small grey pictures that photos are compared by, in pixels."""
+"""Longest side of the small grey pictures by which photos are compared, in pixels."""
 SAME = 1.0
-"""Grey levels: two small pictures that differ by less, in the mean, are one photo twice."""
+"""Mean difference of two small pictures, in grey levels, below which they are the same photo."""
 BLURRED = 0.2
-"""A photo is called blurred if its sharpness is below this share of the median of its ten neighbours."""
+"""Share of the median sharpness of its ten neighbours below which a photo counts as blurred."""
 _DIGITS = 16
 _TURNED = 274  # EXIF's tag of the orientation
-_LYING = (5, 6, 7, 8)  # its values that swap width and height
+_LYING = (5, 6, 7, 8)  # orientations that swap width and height
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo of the scene: the file given, the scene's upright copy (or the same), and what the given one's head says.
+    """A photo of the scene: its source file, the scene's upright copy (or the same file), and what the header states.
 
-    width, height: in pixels, upright. turned: the given one is not. focal: in pixels, if EXIF tells it. mask: id image
-    of the objects that features may lie on; None for all of the photo. ignore_ids: those in it that mean "unlabelled".
+    width, height: in pixels, upright. turned: whether the source is not upright. focal: in pixels, if EXIF states it.
+    mask: id image of the objects on which features may lie; None for the whole photo. ignore_ids: ids of the mask that
+    mean "unlabelled".
     """
 
     source: Path
@@ -54,20 +55,20 @@ class Photo:
 
     @property
     def key(self) -> str:
-        """Return the name in COLMAP's database: COLMAP ends names at a space where it reads pairs."""
+        """Return the name in COLMAP's database, without spaces, which end a name in its lists of pairs."""
         return quote(self.path.name, safe="")
 
 
 @dataclass(frozen=True)
 class Look:
-    """What a small picture tells: the picture [h, w] uint8, and its sharpness (variance of the Laplacian)."""
+    """A photo reduced to ``SIDE``, [h, w] uint8, and its sharpness (variance of the Laplacian)."""
 
     small: np.ndarray
     sharpness: float
 
 
 def find_photos(data: Path) -> list[Path]:
-    """Return the photos of a folder, or of ``images`` in it, by name; raises ``UserError`` for too few or none."""
+    """Return the photos of a folder, or of ``images`` in it, by name; raises ``UserError`` for too few."""
     folder, found = folder_of_photos(data), list_photos(data)
     photo_names(found)
     others = Counter(path.suffix.lower() for path in folder.iterdir() if path.is_file() and path not in set(found))
@@ -83,7 +84,7 @@ def find_photos(data: Path) -> list[Path]:
 
 
 def check_photos(found: Sequence[Path], folder: Path, bar: Bar) -> list[Photo]:
-    """Return what the scene's photos in ``folder`` will be; raises ``UserError`` for photos that cannot be used."""
+    """Return the scene's photos, to be copied to ``folder``; raises ``UserError`` for photos that cannot be used."""
     with bar("photos") as progress:
         return [_checked(path, folder / path.name) for path in counted(found, len(found), progress)]
 
@@ -108,15 +109,15 @@ def _checked(source: Path, path: Path) -> Photo:
 
 
 def with_masks(photos: Sequence[Photo], folder: Path, ignore_ids: tuple[int, ...] = ()) -> list[Photo]:
-    """Return photos with the id images <stem>.png of a folder; raises ``UserError`` where these do not fit.
+    """Return photos with their id images <stem>.png of a folder; raises ``UserError`` where these do not fit.
 
     ignore_ids: see ``Photo``.
     """
-    found = []
+    masked = []
     for photo in photos:
         mask = folder / f"{photo.path.stem}.png"
         if not mask.is_file():
-            found.append(photo)
+            masked.append(photo)
             continue
         if photo.turned:
             raise UserError(
@@ -130,16 +131,16 @@ def with_masks(photos: Sequence[Photo], folder: Path, ignore_ids: tuple[int, ...
             )
         content = content_digest([photo.source, mask])
         digest = (value_digest([content, *ignore_ids]) if ignore_ids else content)[:_DIGITS]
-        found.append(replace(photo, mask=mask, ignore_ids=ignore_ids, digest=digest))
-    if not any(photo.mask for photo in found):
+        masked.append(replace(photo, mask=mask, ignore_ids=ignore_ids, digest=digest))
+    if not any(photo.mask for photo in masked):
         raise UserError(
             f"no mask in {folder} has the name of a photo ({photos[0].path.stem}.png, ...): correct --masks."
         )
-    return found
+    return masked
 
 
 def copy_photos(photos: Sequence[Photo], bar: Bar) -> None:
-    """Write the scene's photos that are not there, upright."""
+    """Write upright copies of the photos that the scene lacks."""
     from PIL import Image, ImageOps
 
     if not (missing := [photo for photo in photos if not photo.path.exists()]):
@@ -158,39 +159,32 @@ def copy_photos(photos: Sequence[Photo], bar: Bar) -> None:
             write_whole(photo.path, partial(copy, photo))
 
 
-def small_grey(photo: np.ndarray) -> np.ndarray:
-    """Return a grey photo [H, W] uint8 reduced to ``SIDE``."""
-    import cv2
-
-    factor = SIDE / max(photo.shape)
-    size = [max(1, round(side * factor)) for side in photo.shape[::-1]]
-    return cv2.resize(photo, size, interpolation=cv2.INTER_AREA) if factor < 1 else photo
-
-
 def look_at(grey: np.ndarray) -> Look:
-    """Return what the small picture of a grey photo [H, W] uint8 tells."""
+    """Return the look of a grey photo [H, W] uint8."""
     import cv2
 
-    small = small_grey(grey)
+    factor = SIDE / max(grey.shape)
+    size = [max(1, round(side * factor)) for side in grey.shape[::-1]]
+    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if factor < 1 else grey
     return Look(small, float(cv2.Laplacian(small, cv2.CV_32F).var()))
 
 
 def blurred(looks: Sequence[Look]) -> list[int]:
-    """Return the photos that are far less sharp than those beside them in order."""
+    """Return the indices of photos far less sharp than their neighbours in the order of names."""
     sharp = np.array([look.sharpness for look in looks])
     around = [np.median(sharp[max(0, index - 5) : index + 6]) for index in range(len(sharp))]
     return np.flatnonzero(sharp < BLURRED * np.array(around)).tolist()
 
 
 def repeated(looks: Sequence[Look]) -> list[int]:
-    """Return the photos that show the same as an earlier one."""
+    """Return the indices of photos that show the same as an earlier one."""
     shapes: dict[tuple[int, ...], list[int]] = {}
-    found = []
+    repeats = []
     for index, look in enumerate(looks):
-        kept = shapes.setdefault(look.small.shape, [])
+        earlier = shapes.setdefault(look.small.shape, [])
         small = look.small.astype(np.int16)
-        if any(np.abs(small - looks[other].small).mean() < SAME for other in kept):
-            found.append(index)
+        if any(np.abs(small - looks[other].small).mean() < SAME for other in earlier):
+            repeats.append(index)
         else:
-            kept.append(index)
-    return found
+            earlier.append(index)
+    return repeats

@@ -1,7 +1,7 @@
-"""Depth of photos whose poses are known: each is compared with its neighbours at many depths (a plane sweep).
+"""Depths of photos with poses by a plane sweep: each photo is compared with its neighbours at many depths.
 
-Costs are one minus the normalised correlation of small windows, which no exposure changes, and are smoothed along rows
-and columns as in semi-global matching (Hirschmueller, PAMI 2008).
+The cost of a depth is one minus the normalised correlation of small windows, which is independent of exposure. Costs
+are smoothed along rows and columns as in semi-global matching (Hirschmueller, PAMI 2008).
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-PLANES = 96  # depths, even in inverse depth
+PLANES = 96  # depths, evenly spaced in inverse depth
 WINDOW = (7, 7)  # pixels that are correlated
-LEAST_CORRELATION = 0.5  # A pixel that fits its neighbours less is not believed.
-LEAST_MARGIN = 0.02  # All other depths must cost more than the best one by this.
-LEAST_VARIANCE = 1e-5  # A window whose grey values, in 0..1, vary less is like any other plain one.
+LEAST_CORRELATION = 0.5  # correlation with the neighbours below which a depth is not sure
+LEAST_MARGIN = 0.02  # cost by which all other depths must exceed the best one
+LEAST_VARIANCE = 1e-5  # variance of grey, in 0..1, below which a window matches any other plain one
 SMALL_CHANGE, LARGE_CHANGE = 0.1, 0.6  # costs of a depth that changes by one plane, or more, from pixel to pixel
-AT_EDGES = 20.0  # A large change costs less where the photo changes too: by 1 + this times the change of grey.
-_UNSEEN = 1.2  # cost of a depth at which no neighbour shows the pixel: that of no correlation at all
+AT_EDGES = 20.0  # a large change costs less where the photo changes too: 1 + this times the change of grey
+_UNSEEN = 1.2  # cost of a depth at which no neighbour shows the pixel, more than that of no correlation
 _INVERSE = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-_WORST = -0.2  # Smaller correlations count as this one.
+_WORST = -0.2  # least correlation; smaller ones count as this
 
 
 @dataclass(frozen=True)
 class PosedPhoto:
-    """A photo of which the camera is known.
+    """A photo with its camera.
 
     grey: [H, W] float32 in 0..1. K: [3, 3] float64, pixels, whose centres lie at + 0.5. pose: [4, 4] float64, world to
     camera, OpenCV axes.
@@ -38,11 +38,11 @@ class PosedPhoto:
 
     @property
     def center(self) -> np.ndarray:
-        """Return the camera's place in the world, [3]."""
+        """Return the camera's position in the world, [3]."""
         return -self.pose[:3, :3].T @ self.pose[:3, 3]
 
     def seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return which points [P, 3] lie in the picture, [P] bool, where they are, [P, 2] pixels, and depths [P]."""
+        """Return which points [P, 3] lie in the picture, [P] bool, their pixels [P, 2] and depths [P]."""
         local = points @ self.pose[:3, :3].T + self.pose[:3, 3]
         z = local[:, 2]
         projected = local @ self.K.T
@@ -59,7 +59,7 @@ class PosedPhoto:
 
 @dataclass(frozen=True)
 class SweptDepth:
-    """inverse: [H, W] float64, 1 / depth along the axis. sure: [H, W] bool. step: of inverse depth between planes."""
+    """inverse: [H, W] float64, 1 / depth along the axis. sure: [H, W] bool. step: inverse depth between planes."""
 
     inverse: np.ndarray
     sure: np.ndarray
@@ -67,7 +67,7 @@ class SweptDepth:
 
 
 def swept(photo: PosedPhoto, neighbours: Sequence[PosedPhoto], nearest: float, farthest: float) -> SweptDepth:
-    """Return the depths between ``nearest`` and ``farthest``, world units, at which neighbours agree best."""
+    """Return the depths between ``nearest`` and ``farthest``, world units, at which the neighbours agree best."""
     planes = np.linspace(1.0 / farthest, 1.0 / nearest, PLANES)
     means, variances = _window(photo.grey)
     costs = np.stack([_costs(photo, other, planes, means, variances) for other in neighbours])
@@ -94,11 +94,11 @@ def _window(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _costs(
     photo: PosedPhoto, other: PosedPhoto, planes: np.ndarray, means: np.ndarray, variances: np.ndarray
 ) -> np.ndarray:
-    """Return 1 - correlation [D, H, W] float32 of a photo with another at each plane; nan where that shows nothing."""
+    """Return 1 - correlation [D, H, W] float32 with another photo at each plane; nan outside of the other photo."""
     relative = other.pose @ np.linalg.inv(photo.pose)
     centres = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
     to_rays, to_pixels = np.linalg.inv(photo.K) @ centres, np.linalg.inv(centres) @ other.K
-    found = np.empty((len(planes), *photo.grey.shape), np.float32)
+    costs = np.empty((len(planes), *photo.grey.shape), np.float32)
     for plane, inverse in enumerate(planes):
         map_to = to_pixels @ (relative[:3, :3] + np.outer(relative[:3, 3], [0.0, 0.0, inverse])) @ to_rays
         moved = cv2.warpPerspective(other.grey, map_to, photo.grey.shape[::-1], flags=_INVERSE, borderValue=(-1.0,))
@@ -108,14 +108,14 @@ def _costs(
         product = cv2.boxFilter(np.multiply(moved, photo.grey), -1, WINDOW) - mean * means
         correlation = product / np.sqrt(np.maximum(variance, LEAST_VARIANCE) * np.maximum(variances, LEAST_VARIANCE))
         correlation[outside] = np.nan
-        found[plane] = 1.0 - np.clip(correlation, _WORST, 1.0)
-    return found
+        costs[plane] = 1.0 - np.clip(correlation, _WORST, 1.0)
+    return costs
 
 
 def _of_best_half(costs: np.ndarray) -> np.ndarray:
     """Return the mean cost [D, H, W] of the better half of the neighbours [N, D, H, W] that show a pixel.
 
-    What stands before a surface hides it from some of them.
+    The other half may see something in front of the surface.
     """
     seen = np.isfinite(costs).sum(axis=0)
     ranked = np.sort(np.where(np.isfinite(costs), costs, np.float32(9.0)), axis=0).cumsum(axis=0)
@@ -124,7 +124,7 @@ def _of_best_half(costs: np.ndarray) -> np.ndarray:
 
 
 def _smoothed(cost: np.ndarray, grey: np.ndarray) -> np.ndarray:
-    """Return the mean of costs [D, H, W] gathered from the left, the right, above and below."""
+    """Return the mean of the costs [D, H, W] accumulated from the left, the right, above and below."""
     rows = np.ascontiguousarray(cost.transpose(1, 2, 0))  # [lines, pixels along them, D]
     columns = np.ascontiguousarray(cost.transpose(2, 1, 0))
     along_rows = _both_ways(rows, np.abs(np.diff(grey, axis=1, prepend=grey[:, :1])))
@@ -137,17 +137,17 @@ def _both_ways(cost: np.ndarray, change: np.ndarray) -> np.ndarray:
 
 
 def _gathered(cost: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Return costs [lines, pixels, D] plus those of the best way through the pixels before on the line.
+    """Return costs [lines, pixels, D] plus the least cost of a path through the earlier pixels of the line.
 
-    change: [lines, pixels], of grey from the pixel before.
+    change: [lines, pixels], difference in grey from the pixel before.
     """
     large = np.maximum(LARGE_CHANGE / (1.0 + AT_EDGES * change), SMALL_CHANGE).astype(np.float32)
-    found = np.empty_like(cost)
-    found[:, 0] = before = cost[:, 0]
+    gathered = np.empty_like(cost)
+    gathered[:, 0] = before = cost[:, 0]
     for pixel in range(1, cost.shape[1]):
         least = before.min(axis=1, keepdims=True)
         way = np.minimum(before, least + large[:, pixel, None])
         np.minimum(way[:, 1:], before[:, :-1] + np.float32(SMALL_CHANGE), out=way[:, 1:])
         np.minimum(way[:, :-1], before[:, 1:] + np.float32(SMALL_CHANGE), out=way[:, :-1])
-        found[:, pixel] = before = cost[:, pixel] + way - least
-    return found
+        gathered[:, pixel] = before = cost[:, pixel] + way - least
+    return gathered

@@ -1,4 +1,4 @@
-"""From a folder of photos or a video to a scene with poses; what was computed is kept, and a second call goes on."""
+"""From a folder of photos or a video to a scene with poses; a second call continues from saved results."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from beags_plugin.system.progress import Bar
 from beags_plugin.system.whole_files import write_text_atomically
 
 REPORT = "poses.json"
-VERSION = 1  # of what is kept; another is computed anew
+VERSION = 1  # version of the saved state; a state of another version is discarded
 WORK = Path("colmap")
 DATABASE = "database.db"
 KEPT = "kept.json"
-SHARE = 0.8  # of the photos; where fewer have a pose, a sentence says what to do
-NAMED = 4  # photos in a sentence
+SHARE = 0.8  # share of photos with a pose below which a note says what to do
+NAMED = 4  # photos named in a sentence
 
 
 class NothingFits(UserError):
@@ -47,7 +47,7 @@ class NothingFits(UserError):
 
 @dataclass
 class Posed:
-    """What was found: photos with poses of all photos, their cameras and points, and sentences for the user."""
+    """Result for the user: numbers of photos, of photos with poses, points and cameras, and notes."""
 
     photos: int
     registered: int
@@ -68,10 +68,10 @@ class Posed:
 
 @dataclass
 class Kept:
-    """What a second call goes on with, beside COLMAP's database.
+    """State that a second call continues from, beside COLMAP's database.
 
-    photos: the digest of each whose features the database holds. paired: the names of those that pairs [of indices] are
-    chosen for. posed: the digests of those that transforms.json was made from.
+    photos: name to digest of the photos whose features the database holds. paired: names of the photos for which
+    ``pairs`` of indices were chosen. posed: name to digest of the photos behind transforms.json.
     """
 
     version: int = VERSION
@@ -82,7 +82,7 @@ class Kept:
 
     @classmethod
     def read(cls, work: Path) -> Kept:
-        """Return what is kept in a folder; without it, also remove its database."""
+        """Return the state saved in a folder; without a valid one, remove the folder's database."""
         try:
             kept = cls(**json.loads((work / KEPT).read_text(encoding="utf-8")))
             if kept.version == VERSION:
@@ -93,7 +93,7 @@ class Kept:
         return cls()
 
     def write(self, work: Path) -> None:
-        """Keep it; before what it tells of is computed."""
+        """Save the state; called before the work that it describes."""
         write_text_atomically(json.dumps(asdict(self)) + "\n", work / KEPT)
 
 
@@ -102,7 +102,7 @@ def process(
 ) -> tuple[Posed, Any]:
     """Find the poses of photos and write them into ``output``; returns the report and pycolmap's reconstruction.
 
-    masks: folder of id images <photo>.png, outside of whose objects no feature is used. ignore_ids: see ``Photo``.
+    masks: folder of id images <photo>.png; only features on their objects are used. ignore_ids: see ``Photo``.
     Raises ``UserError`` where the photos cannot be used, ``NothingFits`` where fewer than three fit together.
     """
     if find_spec("pycolmap") is None:
@@ -140,7 +140,7 @@ def process(
 
 
 def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
-    """Find poses in a folder that no other process writes."""
+    """Find poses in a folder that this process has locked."""
     import pycolmap
 
     work, masked = output / WORK, any(photo.mask for photo in photos)
@@ -157,7 +157,7 @@ def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
         if photo.source.resolve() != photo.path.resolve():
             photo.path.unlink(missing_ok=True)
     if photos[0].source.resolve() != photos[0].path.resolve():
-        for name in kept.photos.keys() - content.keys():  # left out since
+        for name in kept.photos.keys() - content.keys():  # photos that the user has left out since
             (output / "images" / name).unlink(missing_ok=True)
     if changed or kept.paired != names:
         kept.paired, kept.pairs = [], []

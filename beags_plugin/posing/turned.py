@@ -1,4 +1,4 @@
-"""Objects that turned before a room that stood still: poses found from the room say nothing about them."""
+"""Detection of objects that turned before a room that stood still, for which the room's poses are wrong."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ import numpy as np
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.labels.classes import read_id_mask
 
-FEW = 0.25  # of the share around objects; 0.1 on a generated turntable, 0.56 and 3.9 on two captures of still things
-LEAST = 200  # features inside, for their share to tell anything
-TURN = 5.0  # degrees by which two models tell another motion between two photos, in the median of all pairs
-ENOUGH = 0.75  # of the photos that the room places, or of all, which the objects alone must place too
-MORE = 2.0  # times the share of features inside that the room's poses explain; 6 on the generated turntable
+FEW = 0.25  # ratio to the share around objects; 0.1 on a generated turntable, 0.56 and 3.9 on two still captures
+LEAST = 200  # features inside objects that make their share reliable
+TURN = 5.0  # degrees by which two models must differ in the turn between two photos, median of all pairs
+ENOUGH = 0.75  # share of the photos with poses from the room, or of all, that must have poses from the objects alone
+MORE = 2.0  # ratio to the share inside objects that the room's poses explain; 6 on the generated turntable
 
 
 def shares_explained(photos: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[float, float, int]:
-    """Return the share of features with a point in space inside objects, that around them, and the number inside.
+    """Return the shares of features that have a 3D point, inside and around objects, and the number of features inside.
 
-    photos: of each, places of features [N, 2] in 0..1 (from the left, from the top), whether each has a point [N] bool,
-    and class ids [H, W].
+    photos: for each, positions of features [N, 2] in 0..1 (from the left, from the top), [N] bool whether each has a
+    3D point, and class ids [H, W].
     """
-    table = np.zeros((2, 2), np.int64)  # inside or around; with a point, all
+    table = np.zeros((2, 2), np.int64)  # rows: inside, around; columns: with a point, all
     for places, known, ids in photos:
         height, width = ids.shape
         columns, rows = np.clip((places * [width, height]).astype(np.int64), 0, [width - 1, height - 1]).T
@@ -36,20 +36,21 @@ def shares_explained(photos: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 def seem_turned(inside: float, around: float, count: int) -> bool:
-    """Return whether the poses explain so few features inside objects (see ``shares_explained``) that these moved."""
+    """Return whether so few features inside objects have points (``shares_explained``) that the objects moved."""
     return count >= LEAST and inside < FEW * around
 
 
 def objects_seem_turned(model: Path, masks: Path) -> bool:
-    """Return whether the poses of a COLMAP model are hardly those of the objects in masks <photo>.png."""
+    """Return whether the objects in masks <photo>.png seem to have moved against the poses of a COLMAP model."""
     return seem_turned(*shares_explained(_features(_read(model), masks)))
 
 
 def poses_are_their_own(objects: Path, room: Path, masks: Path) -> bool:
-    """Return whether poses from the objects' features alone are to be taken instead of those from whole photos.
+    """Return whether poses from the objects' features alone should replace poses from whole photos.
 
-    They are if ``ENOUGH`` of the photos have them, if they turn otherwise from photo to photo (``TURN``), and if they
-    explain ``MORE`` times the share of features inside masks <photo>.png. objects, room: folders of COLMAP models.
+    They should if ``ENOUGH`` of the photos have them, if they turn differently from photo to photo (``TURN``), and if
+    they give points to ``MORE`` times the share of features inside masks <photo>.png. objects, room: folders of COLMAP
+    models.
     """
     models = [_read(folder) for folder in (objects, room)]
     turns: list[dict[str, np.ndarray]] = []
@@ -59,7 +60,9 @@ def poses_are_their_own(objects: Path, room: Path, masks: Path) -> bool:
     names = sorted(turns[0].keys() & turns[1].keys())
     if len(names) < max(2, ENOUGH * len(turns[1])):
         return False
-    between = np.array([turns[0][name].T @ turns[1][name] for name in names]).reshape(-1, 9)  # one rotation, if alike
+    between = np.array([turns[0][name].T @ turns[1][name] for name in names]).reshape(
+        -1, 9
+    )  # one rotation if both agree
     cosine = (between @ between.T - 1) / 2
     if np.median(cosine[np.triu_indices(len(names), 1)]) > np.cos(np.deg2rad(TURN)):
         return False
@@ -74,7 +77,7 @@ def _read(model: Path) -> Any:
 
 
 def _features(model: Any, masks: Path) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield what ``shares_explained`` takes of each photo of pycolmap's reconstruction that has a mask."""
+    """Yield the input of ``shares_explained`` for each photo of pycolmap's reconstruction that has a mask."""
     for image_id in model.reg_image_ids():
         image = model.images[image_id]
         camera, mask = model.cameras[image.camera_id], masks / f"{Path(image.name).stem}.png"

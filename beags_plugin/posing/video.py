@@ -1,4 +1,4 @@
-"""Frames of a video to find poses for: the sharpest ones, at even distances of motion."""
+"""Choice of the frames of a video to find poses for: the sharpest ones, at even distances of motion."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from beags_plugin.system.reading.stand_ins import stand_in
 from beags_plugin.system.whole_files import write_text_atomically, write_whole
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-RECORD = "frames.json"  # beside the frames: of which video they are
-MOST = 150  # frames
+RECORD = "frames.json"  # file beside the frames that names their video
+MOST = 150  # frames that are chosen
 STEP = 0.03
-"""Motion between chosen frames, as a share of the picture's longest side, at least."""
-_POINTS = 200  # of a frame, followed into the next
+"""Least motion between chosen frames, as a share of the picture's longest side."""
+_POINTS = 200  # points of a frame that are followed into the next
 
 
 def is_video(data: Path) -> bool:
-    """Return whether ``data`` is a video by its name, or a folder; raises ``UserError`` for another file."""
+    """Return whether ``data`` is a video, by its name; raises ``UserError`` for other files."""
     if data.is_file() and data.suffix.lower() not in VIDEO_SUFFIXES:
         raise UserError(
             f"{data} is no video that is known by its name ({', '.join(VIDEO_SUFFIXES)}): give a folder of photos."
@@ -35,12 +35,12 @@ def is_video(data: Path) -> bool:
 
 
 def find_frames(video: Path, folder: Path, bar: Bar) -> list[Path]:
-    """Return the files in ``folder`` for the frames worth having; ``write_frames`` writes them.
+    """Return the files in ``folder`` for the chosen frames; ``write_frames`` writes them.
 
-    Raises ``UserError`` for a video that cannot be read, or that hardly moves.
+    Raises ``UserError`` for a video that cannot be read or hardly moves.
     """
-    if (kept := _record(folder)).get("video") == content_digest([video]):
-        return [folder / name for name in kept["frames"]]
+    if (record := _record(folder)).get("video") == content_digest([video]):
+        return [folder / name for name in record["frames"]]
     with bar("looking at frames") as progress, _frames(video) as (frames, total):
         sharpness, motions = [], []
         before: Look | None = None
@@ -84,7 +84,7 @@ def _record(folder: Path) -> dict[str, Any]:
 def choose_frames(motions: np.ndarray, sharpness: np.ndarray) -> list[int]:
     """Return the sharpest frame of each stretch of equal motion, in order.
 
-    motions: of each frame, since the one before, in longest sides. Stretches are at least ``STEP`` long.
+    motions: motion of each frame since the one before, in longest sides. Stretches are at least ``STEP`` long.
     """
     way = np.cumsum(motions)
     if len(way) == 0:
@@ -103,8 +103,8 @@ def _motion(before: Look, now: Look) -> float:
     corners = cv2.goodFeaturesToTrack(before.small, _POINTS, 0.01, 5)
     if corners is None:
         return 0.0
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(before.small, now.small, corners, np.empty_like(corners))
-    ways = np.linalg.norm(moved - corners, axis=-1)[found == 1]
+    moved, tracked, _ = cv2.calcOpticalFlowPyrLK(before.small, now.small, corners, np.empty_like(corners))
+    ways = np.linalg.norm(moved - corners, axis=-1)[tracked == 1]
     return float(np.median(ways)) / max(now.small.shape) if len(ways) else 0.0
 
 
