@@ -1,4 +1,4 @@
-"""Scores of an object at the size of the photo's file, within the object's box (our extension)."""
+"""Scores of an object within its box at the resolution of the photo's file (our extension)."""
 
 from __future__ import annotations
 
@@ -7,33 +7,31 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from beags_plugin.evaluation.metrics import CloseUpMetrics, MaskMetrics, band_width, psnr
 from beags_plugin.evaluation.records import EvalView
-from beags_plugin.evaluation.truths import extracted_truth, rendered_truth
+from beags_plugin.evaluation.truths import extracted_truth, rendered_truth, resized
 from beags_plugin.labels.borders import at_border
-from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.losses.photometric import ssim_map
 
 MARGIN = 0.5
-"""Of the object's longer side, on each side of its box: what it spills farther off is not in the close-up."""
+"""Margin around the object's box, as a share of its longer side; spill farther off is not in the close-up."""
 
 
 def close_up(view: EvalView, class_id: int) -> EvalView | None:
-    """Return the part of a view around an object at the size of the photo's file, with the masks of that part.
+    """Return the part of a view around an object at the resolution of the photo's file, with the masks of that part.
 
-    None where the photo is not larger than what is trained on, without a mask, and where the photo lacks the object.
+    None if the photo's file is not larger than the training image, without a mask, or without the object in the photo.
     """
     truth = extracted_truth(view, class_id)
     if view.full is None or truth is None or not truth.mask.any():
         return None
     width, height = view.full.camera.width, view.full.camera.height
-    left, top, right, bottom = _box(_sized(truth.mask, height, width))
+    left, top, right, bottom = _box(resized(truth.mask, height, width))
 
     def part(mask: Tensor) -> Tensor:
-        return _sized(mask, height, width)[top:bottom, left:right]
+        return resized(mask, height, width)[top:bottom, left:right]
 
     def parts(masks: Mapping[int, Tensor] | None) -> Mapping[int, Tensor] | None:
         return None if masks is None else {index: part(mask) for index, mask in masks.items()}
@@ -52,36 +50,31 @@ def close_up(view: EvalView, class_id: int) -> EvalView | None:
 
 
 def band_of(view: EvalView, share: float) -> int:
-    """Return the width of the boundary band of a view's masks at the size of its photo's file, pixels."""
+    """Return the width of the boundary band of a view's masks at the resolution of its photo's file, pixels."""
     assert view.full is not None
     return band_width(view.full.camera.height, view.full.camera.width, share)
 
 
 def close_up_metrics(part: EvalView, class_id: int, color: Tensor, agreement: MaskMetrics) -> CloseUpMetrics:
-    """Return PSNR and SSIM inside the visible object, beside the agreement of its extracted mask.
+    """Return PSNR and SSIM inside the visible object, together with the agreement of its extracted mask.
 
-    part: of ``close_up``. color: [h, w, 3] float in 0..1, the whole scene rendered. Pixels next to others do not count.
+    part: a result of ``close_up``. color: [h, w, 3] float in 0..1, the whole scene rendered. Pixels at the border of
+    the object do not count.
     """
-    found = CloseUpMetrics(None, None, agreement.iou, agreement.biou, agreement.spill)
+    metrics = CloseUpMetrics(None, None, agreement.iou, agreement.biou, agreement.spill)
     visible = rendered_truth(part, class_id)
     if visible is None or part.image is None:
-        return found
+        return metrics
     inside = visible.mask & ~at_border(visible.mask.int())
     if not inside.any():
-        return found
+        return metrics
     photo, inside = part.image.to(color), inside.to(color.device)
     similar = float(ssim_map(color, photo)[inside].mean())
-    return replace(found, psnr=psnr(color[inside], photo[inside]), ssim=similar)
-
-
-def _sized(mask: Tensor, height: int, width: int) -> Tensor:
-    if mask.shape == (height, width):
-        return mask
-    return torch.from_numpy(resize_nearest(mask.cpu().numpy(), height, width))
+    return replace(metrics, psnr=psnr(color[inside], photo[inside]), ssim=similar)
 
 
 def _box(mask: Tensor) -> tuple[int, int, int, int]:
-    """Return left, top, right and bottom around a mask [H, W], with a margin, within the image."""
+    """Return left, top, right and bottom of a mask's box [H, W] with its margin, cut off at the image."""
     rows, columns = (np.flatnonzero(mask.cpu().numpy().any(axis=axis)) for axis in (1, 0))
     (top, bottom), (left, right) = (rows[0], rows[-1] + 1), (columns[0], columns[-1] + 1)
     margin = math.ceil(MARGIN * max(bottom - top, right - left))

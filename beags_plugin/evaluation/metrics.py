@@ -15,17 +15,15 @@ from beags_plugin.labels.class_ids import resize_nearest
 
 AGREEMENT = ("acc", "iou", "biou")
 METRICS = (*AGREEMENT, "spill")
-CLOSE_UP_METRICS = ("psnr", "ssim", "iou", "biou", "spill")
-REMOVAL_METRICS = ("psnr", "psnr_shown", "shown", "ssim", "remains")
 
 
 @dataclass(frozen=True)
 class MaskMetrics:
-    """Agreement of one predicted mask with its truth, or a mean of it.
+    """Agreement of a predicted mask with its truth, or a mean over masks.
 
     acc: pixel accuracy. iou: intersection over union. biou: IoU of the inner boundary bands. Each is in 0..1, higher is
     better. spill: see ``spill``; 0 or more, lower is better. covered: see ``covered``, of the whole scene; 0..1, lower
-    is better. None: nothing to compare, as where both masks are empty; it is left out of means.
+    is better. None: nothing to compare, for example two empty masks; means leave it out.
     """
 
     acc: float | None
@@ -37,10 +35,10 @@ class MaskMetrics:
 
 @dataclass(frozen=True)
 class RemovalMetrics:
-    """What is left where an object was taken out of the scene, or a mean of it; see ``removal.removal_metrics``.
+    """Quality of a scene without an object where the object was, or a mean; see ``removal.removal_metrics``.
 
-    psnr: dB, infinite for equal pixels. psnr_shown: over the pixels that can be known; shown: their share. ssim: at
-    most 1. remains: 0..1, lower is better. None as in ``MaskMetrics``.
+    psnr: dB, infinite for equal pixels. psnr_shown: over pixels whose surface training photos show. shown: their share.
+    ssim: at most 1. remains: 0..1, lower is better. None as in ``MaskMetrics``.
     """
 
     psnr: float | None
@@ -52,10 +50,10 @@ class RemovalMetrics:
 
 @dataclass(frozen=True)
 class CloseUpMetrics:
-    """An object at the size of the photo's file, within its box, or a mean of that; see ``close_up``.
+    """Scores of an object within its box at the resolution of the photo's file, or a mean; see ``close_up``.
 
-    psnr, ssim: of the whole scene, over the visible object, dB and at most 1. iou, biou, spill: of the object drawn
-    alone, as in ``MaskMetrics``. None as there.
+    psnr (dB), ssim (at most 1): the whole scene over the visible object. iou, biou, spill: the object rendered alone,
+    as in ``MaskMetrics``. None as there.
     """
 
     psnr: float | None
@@ -76,7 +74,7 @@ def band_width(height: int, width: int, share: float = Protocol.band_share) -> i
 
 
 def boundary_band(mask: np.ndarray, width: int) -> np.ndarray:
-    """Return the pixels of ``mask`` [H, W] bool that ``width`` 3 x 3 erosions take away; outside counts as no mask."""
+    """Return the pixels of ``mask`` [H, W] bool that ``width`` 3 x 3 erosions remove; the mask ends at the image."""
     eroded = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=width, borderValue=(0,))
     return mask & (eroded == 0)
 
@@ -84,11 +82,11 @@ def boundary_band(mask: np.ndarray, width: int) -> np.ndarray:
 def compared_masks(
     prediction: Any, truth: Any, ignore: Any = None, protocol: Protocol | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the two masks at one size, as they are compared, and the pixels that count: three bool arrays.
+    """Return prediction and truth at one size and the pixels that count: three bool arrays.
 
     prediction: [H', W'] bool array or tensor. truth: [H, W] bool. ignore: [H, W] bool or None. The arrays have the size
-    of the truth (of the prediction, if the protocol resizes the truth). A prediction counts as right where a pixel does
-    not count, so that a hole in an ignored region makes no boundary. Raises ``ValueError`` as ``mask_metrics`` does.
+    of the truth (of the prediction, if the protocol resizes the truth). Where a pixel does not count, the prediction is
+    set to the truth, so that ignored regions make no boundary. Raises ``ValueError`` as ``mask_metrics`` does.
     """
     protocol = protocol or Protocol()
     predicted, true = _array(prediction).astype(bool), _array(truth).astype(bool)
@@ -111,8 +109,8 @@ def mask_metrics(
     """Return Acc, IoU, BIoU and spill of a mask (method, section 8).
 
     prediction: [H', W'] bool array or tensor. truth: [H, W] bool. ignore: [H, W] bool or None; True pixels count
-    nowhere. band: width of the boundary band, pixels, if not the protocol's share of the masks' diagonal.
-    A mask that is empty in truth and prediction is not scored: all are None. Raises ``ValueError`` for masks that are
+    nowhere. band: width of the boundary band, pixels; the protocol's share of the masks' diagonal if None. If truth and
+    prediction are empty, all metrics are None. Raises ``ValueError`` for masks that are
     not two-dimensional and for an ``ignore`` of another size than the truth.
     """
     protocol = protocol or Protocol()
@@ -134,23 +132,25 @@ def mask_metrics(
 
 
 def spill(predicted: np.ndarray, true: np.ndarray, counted: np.ndarray, margin: float) -> float | None:
-    """Return the area of a mask that lies far outside of the truth, as a share of the truth's area; None without truth.
+    """Return the area of a mask far outside of the truth, as a share of the truth's area; None if the truth is empty.
 
-    predicted, true, counted: [H, W] bool, as ``compared_masks`` returns them. margin: pixels; what lies at most so far
-    from a pixel of ``true``, centre to centre, is no spill. Only counted pixels enter both areas.
+    predicted, true, counted: [H, W] bool, as ``compared_masks`` returns them. margin: pixels; pixels up to this far
+    from a pixel of ``true``, centre to centre, are no spill. Only counted pixels enter both areas.
     """
     area = np.count_nonzero(true & counted)
     if area == 0:
         return None
     distance = cv2.distanceTransform((~true).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    squared = np.rint(np.square(distance, dtype=np.float64))  # whole numbers, but for OpenCV's rounding of the root
+    squared = np.rint(
+        np.square(distance, dtype=np.float64)
+    )  # squared distances are whole numbers, except for OpenCV's rounding of the root
     return np.count_nonzero(predicted & counted & (squared > margin**2)) / area
 
 
 def covered(prediction: Any, truth: Any, ignore: Any = None, protocol: Protocol | None = None) -> float | None:
-    """Return the share of the truth's pixels that a mask lacks, as where fog stands before an object.
+    """Return the share of the truth's pixels that a mask lacks, for example because fog covers an object.
 
-    None without a pixel of truth that counts; else as ``mask_metrics``.
+    None if no pixel of the truth counts. Arguments and errors are those of ``mask_metrics``.
     """
     predicted, true, counted = compared_masks(prediction, truth, ignore, protocol)
     area = np.count_nonzero(true & counted)
@@ -158,10 +158,9 @@ def covered(prediction: Any, truth: Any, ignore: Any = None, protocol: Protocol 
 
 
 def psnr(a: Any, b: Any) -> float:
-    """Return the peak signal-to-noise ratio in dB of two images of one shape, values in 0..1; infinite if they are
-    equal.
+    """Return the peak signal-to-noise ratio of two images in dB; infinite if they are equal.
 
-    a, b: float arrays or tensors. Raises ``ValueError`` if the shapes differ.
+    a, b: float arrays or tensors of one shape, values in 0..1. Raises ``ValueError`` if the shapes differ.
     """
     first, second = _array(a).astype(np.float64), _array(b).astype(np.float64)
     if first.shape != second.shape:
@@ -177,9 +176,9 @@ def mean(values: Iterable[float | None]) -> float | None:
 
 
 def mean_metrics(metrics: Iterable[Any]) -> Any:
-    """Return the mean of each metric over those who have it, as metrics of the same type; None for no metrics at all.
+    """Return the mean of each metric over the rows that have it, in the type of the rows; None without rows.
 
-    metrics: ``MaskMetrics``, or ``RemovalMetrics``, or None.
+    metrics: rows of one of the types above; None is left out.
     """
     rows = [row for row in metrics if row is not None]
     if not rows:

@@ -1,22 +1,22 @@
-"""The choices of mask scoring that papers make differently, each with its default (method, section 8)."""
+"""Choices of mask scoring on which papers differ, with their defaults (method, section 8)."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal, get_args, get_type_hints
+from dataclasses import dataclass, fields
+from typing import Literal, get_args, get_type_hints
 
 from beags_plugin.system.errors import UserError, check_choice
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """The choices behind a figure; the defaults are the paper's where it states them."""
+    """The choices behind a score; the defaults are the paper's where it states them."""
 
     threshold: float = 0.5
-    """A pixel belongs to a mask where the alpha (extracted) or the drawn value (rendered) is greater."""
+    """A pixel belongs to a mask where the alpha (extracted) or the rendered value (rendered) is greater."""
     resize: Literal["prediction", "truth"] = "prediction"
-    """Which of the two masks is brought to the other's size, by nearest pixel."""
+    """Which of the two masks is resized to the other's size, by nearest pixel."""
     scene_average: Literal["masks", "objects", "views"] = "masks"
     """Mean of a scene: over all its masks; or over the means of the objects; or over the means of the views."""
     data_set_average: Literal["scenes", "pooled"] = "scenes"
@@ -35,7 +35,3 @@ class Protocol:
         for field in fields(self):
             if choices := get_args(types[field.name]):
                 check_choice(getattr(self, field.name), choices, "value", f" for {field.name}")
-
-    def to_json(self) -> dict[str, Any]:
-        """Return every choice by name."""
-        return asdict(self)

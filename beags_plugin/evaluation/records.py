@@ -3,50 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.evaluation.metrics import (
-    AGREEMENT,
-    CLOSE_UP_METRICS,
-    METRICS,
-    REMOVAL_METRICS,
-    CloseUpMetrics,
-    MaskMetrics,
-    RemovalMetrics,
-)
+from beags_plugin.evaluation.metrics import AGREEMENT, METRICS, CloseUpMetrics, MaskMetrics, RemovalMetrics
 
 MaskKind = Literal["extracted", "seen", "rendered"]
 MASK_KINDS: tuple[MaskKind, ...] = ("extracted", "seen", "rendered")
-"""extracted: the object rendered alone. seen: the same over the parts that training photos show, where the data says
-which. rendered: the object's share of the whole scene."""
+"""extracted: the object rendered alone. seen: the same over the parts that training photos show, if the data has a map
+of them. rendered: the object's share of the whole scene."""
 Kind = MaskKind | Literal["removal", "close_up"]
 FIGURES: dict[Kind, tuple[str, ...]] = {
     "extracted": METRICS,
     "seen": METRICS,
     "rendered": (*AGREEMENT, "covered"),
-    "removal": REMOVAL_METRICS,
-    "close_up": CLOSE_UP_METRICS,
+    "removal": tuple(field.name for field in fields(RemovalMetrics)),
+    "close_up": tuple(field.name for field in fields(CloseUpMetrics)),
 }
-"""The names of the figures of each kind. Spill is of objects drawn alone, covered of the whole scene. removal: the
-scene rendered without the object, where the data has an exact picture of that. close_up: the object at the size of the
-photo's file, where that is larger than what is trained on."""
+"""Names of the metrics of each kind. Spill belongs to objects rendered alone, covered to the whole scene. removal: the
+scene rendered without the object, if the data has an exact picture of that. close_up: the object at the resolution of
+the photo's file, if that is larger than the training image."""
 KINDS = tuple(FIGURES)
 IMAGE_FIGURES = ("psnr", "psnr_fit", "psnr_shown", "shown", "psnr_objects", "ssim")
-"""Of whole images. psnr_fit: after the affine map of colours that fits the photo best, one a photo, clamped to 0..1.
-psnr_shown: over the pixels whose surface some training photo shows; shown: their share.
-psnr_objects: over the pixels of any object but those next to the background. These two are taken after that map where
-``SceneMetrics.colors_fitted`` says so."""
+"""Metrics of whole images. psnr_fit: after the affine colour map that fits the photo best, one for each photo, clamped
+to 0..1. psnr_shown: over the pixels whose surface some training photo shows; shown: their share. psnr_objects: over the
+pixels of all objects, except those next to the background. psnr_shown and psnr_objects are taken after the colour map
+if ``SceneMetrics.colors_fitted``."""
 
 
 @dataclass(frozen=True)
 class FullPhoto:
-    """A photo at the size of its file. camera: of all of it.
+    """A photo at the resolution of its file. camera: camera of the whole photo.
 
-    region: reads left, top, right and bottom, pixels; returns its camera and [h, w, 3] float in 0..1.
+    region: takes left, top, right and bottom, pixels; returns the camera and the image [h, w, 3], float in 0..1.
     """
 
     camera: Camera
@@ -58,15 +50,14 @@ class EvalView:
     """One held-out view and its ground truth.
 
     image: [H, W, 3] float in 0..1, the photograph, or None. visible: [h, w] integer class ids or IGNORE, or None
-    without masks; predictions are resized to it. silhouettes: object id to [h, w] bool, what the object covers when
-    nothing stands before it. seen: object id to [h, w] bool, the part of the silhouette whose surface some training
-    photo shows; metrics of the kind "seen" leave out the rest. visible_objects: object id to [h, w] bool, the visible
-    part where single objects were labelled and nothing is known of the others; scored instead of ``visible``. removed:
-    object id to [H, W, 3] float in 0..1, the exact picture without it. removed_shown: object id to [h, w] bool, the
-    part of the silhouette where that picture shows surface which some training photo shows. unknown_silhouettes,
-    unknown_visible: object id to [h, w] bool, the pixels of which cannot be told whether its silhouette, or its mask in
-    ``visible_objects``, holds them; they are in neither and count nowhere. full: the photograph at the size of its
-    file, where that is larger.
+    without masks; predictions are resized to it. silhouettes: object id to [h, w] bool, pixels that the object covers
+    when nothing stands before it. seen: object id to [h, w] bool, the part of the silhouette whose surface some
+    training photo shows; metrics of the kind "seen" leave out the rest. visible_objects: object id to [h, w] bool, the
+    visible part if only some objects were labelled; scored instead of ``visible``. removed: object id to [H, W, 3]
+    float in 0..1, the exact picture without it. removed_shown: object id to [h, w] bool, the part of the silhouette
+    where that picture shows surface which some training photo shows. unknown_silhouettes, unknown_visible: object id to
+    [h, w] bool, pixels that may or may not belong to its silhouette or to its mask in ``visible_objects``; they are in
+    neither and do not count. full: the photograph at the resolution of its file, if that is larger.
     """
 
     camera: Camera
@@ -85,7 +76,7 @@ class EvalView:
 
 @dataclass(frozen=True)
 class ObjectMetrics:
-    """The metrics of each kind; None where there was nothing to compare with."""
+    """The metrics of each kind; None if there was nothing to compare with."""
 
     extracted: MaskMetrics | None
     rendered: MaskMetrics | None
@@ -96,7 +87,7 @@ class ObjectMetrics:
 
 @dataclass(frozen=True)
 class MaskRecord:
-    """One scored mask, or object taken out.
+    """One scored mask or removal.
 
     kind: see ``KINDS``. view: index of the view. truth: "silhouette" or "visible".
     """
@@ -110,9 +101,9 @@ class MaskRecord:
 
 @dataclass(frozen=True)
 class ViewRecord:
-    """The image of one view: its name, PSNR in dB (infinite for equal images) and SSIM; None without a photograph.
+    """Metrics of the image of one view: PSNR in dB (infinite for equal images) and SSIM; None without a photograph.
 
-    The others: see ``IMAGE_FIGURES``; None where that is not known, or no pixel is such.
+    The others: see ``IMAGE_FIGURES``; None if they are unknown or no pixel counts.
     """
 
     name: str
@@ -126,12 +117,12 @@ class ViewRecord:
 
 @dataclass(frozen=True)
 class SceneMetrics:
-    """The figures of a scene over all its views.
+    """The metrics of a scene over all its views.
 
-    mean: over the scene, as the protocol says. objects: object id to the mean over its masks. psnr: dB, mean over the
-    views with a photograph, infinite for equal images; None without any. Other ``IMAGE_FIGURES``: likewise.
+    mean: mean over the scene, as the protocol defines it. objects: object id to the mean over its masks. psnr: dB, mean
+    over the views with a photograph, infinite for equal images; None without any. Other ``IMAGE_FIGURES``: likewise.
     extracted_truth: "silhouette" (occlusion-free), "visible" (without the pixels where another object hides this one),
-    "both", or None. masks, views: the single figures behind these means. colors_fitted: see ``evaluate_scene``.
+    "both", or None. masks, views: the single metrics behind these means. colors_fitted: see ``evaluate_scene``.
     """
 
     mean: ObjectMetrics

@@ -1,4 +1,4 @@
-"""What is left of an object after its Gaussians are taken out, against an exact picture without it."""
+"""Scores of scenes from which an object was removed, against an exact picture without it."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from beags_plugin.evaluation.metrics import RemovalMetrics, psnr
 from beags_plugin.losses.photometric import ssim_map
 
 TELLING = 0.1
-"""Least distance of photo and exact picture, RGB in 0..1, at which a pixel tells whether the object still shows.
+"""Least distance between photo and exact picture, RGB in 0..1, at which a pixel tells whether the object remains.
 
-Where they are more alike, the ordinary error of a rendering decides which of the two it is nearer to."""
+If they are closer, ordinary rendering errors decide which of the two the rendering is nearer to."""
 
 
 def removal_metrics(
     rendered: Tensor, photo: Tensor, exact: Tensor, silhouette: Tensor, known: Tensor | None = None
 ) -> RemovalMetrics:
-    """Return PSNR and SSIM against the exact picture where the object was, and the share of it that still shows.
+    """Return PSNR and SSIM against the exact picture where the object was, and the share of the object that remains.
 
     rendered: [H, W, 3] float in 0..1, the scene without the object's Gaussians. photo, exact: the same view with and
-    without the object. silhouette: [H, W] bool. known: [H, W] bool, where the exact picture has surface that some
-    training photo shows, or None. All figures are over the silhouette; SSIM is the mean of its map, whose windows reach
-    outside. Remains show in a pixel if its rendering is nearer to the photo than to the exact picture, of the pixels
-    where these two differ by ``TELLING`` or more. A figure without pixels is None.
+    without the object. silhouette: [H, W] bool. known: [H, W] bool, pixels whose surface in the exact
+    picture some training photo shows, or None. All metrics are over the silhouette; SSIM is the mean of its map, whose
+    windows reach outside. The object remains in a pixel if the rendering is nearer to the photo than to the exact
+    picture; only pixels where these two differ by ``TELLING`` or more count. A metric without pixels is None.
     """
     if not silhouette.any():
         return RemovalMetrics(None, None, None, None, None)

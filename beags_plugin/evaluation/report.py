@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from beags_plugin.evaluation.metrics import mean, mean_metrics
@@ -23,10 +23,10 @@ CSV_COLUMNS = (
 
 @dataclass(frozen=True)
 class RunMetrics:
-    """The figures of one run.
+    """The metrics of one run.
 
     scene: its name in tables. config: path of the run. classes: id to name, with or without the background. before:
-    after assignment alone, None where the run has kept no such state. notes: sentences for readers of the figures.
+    the state after assignment alone, None if the run has not saved it. notes: sentences for readers of the metrics.
     """
 
     scene: str
@@ -49,18 +49,18 @@ class RunMetrics:
         return {c: f"{name} ({c})" if taken.count(name) > 1 else name for c, name in names.items()}
 
     def worst(self) -> str | None:
-        """Return the name of the object with the lowest extracted BIoU as the run is; None if none was scored."""
+        """Return the name of the object with the lowest extracted BIoU in the final state; None if none was scored."""
         names = self.names()
         scores = {c: found.extracted.biou for c, found in self.after.objects.items() if found.extracted is not None}
         known = {c: score for c, score in scores.items() if score is not None}
         return names[min(known, key=lambda c: known[c])] if known else None
 
     def to_json(self) -> dict[str, Any]:
-        """Return the run as plain values for ``json.dump``; a figure that does not exist or is infinite is None.
+        """Return the run as plain values for ``json.dump``; a missing or infinite metric is None.
 
         {"scene", "config", "protocol": {choice: value}, "extracted_truth", "colors_fitted", "notes": [sentence],
         "mean": {"extracted": {"before": {``FIGURES``}, "after": {...}}, "seen": {...}, "rendered": {...}, "removal":
-        {"before": {``REMOVAL_METRICS``}, "after": {...}}}, "objects": {name: as mean}, "worst": name, "masks":
+        {...}, "close_up": {...}}, "objects": {name: as mean}, "worst": name, "masks":
         [{"kind", "object", "view", "truth", "before": as in mean, "after": {...}}], "views": [{"view"}]}, and
         {"before", "after"} of every one of ``IMAGE_FIGURES`` in itself and in each view.
         """
@@ -84,7 +84,7 @@ class RunMetrics:
         return {
             "scene": self.scene,
             "config": self.config,
-            "protocol": self.protocol.to_json(),
+            "protocol": asdict(self.protocol),
             "extracted_truth": self.after.extracted_truth,
             "colors_fitted": self.after.colors_fitted,
             "notes": list(self.notes),
@@ -124,7 +124,7 @@ class DataSetMetrics:
         empty = ObjectMetrics(None, None)
         return {
             "data_set": self.name,
-            "protocol": self.runs[0].protocol.to_json(),
+            "protocol": asdict(self.runs[0].protocol),
             "mean": {
                 kind: {stage: plain_metrics(kind, getattr(self.means.get(stage, empty), kind)) for stage in STAGES}
                 for kind in KINDS
@@ -180,9 +180,7 @@ def data_set(name: str, runs: Sequence[RunMetrics]) -> DataSetMetrics:
 
 
 def _comparable(runs: Sequence[RunMetrics], has: Callable[[SceneMetrics], Any]) -> dict[Stage, list[SceneMetrics]]:
-    """Return stage to the scenes with a figure, without "before" if some have only "after": a mean of fewer would
-    mislead.
-    """
+    """Return stage to the scenes with a metric; no "before" if some have only "after": the means would differ in scenes."""
     found = [run for run in runs if has(run.after) is not None]
     scenes: dict[Stage, list[SceneMetrics]] = {"after": [run.after for run in found]}
     before = [run.before for run in found if run.before is not None and has(run.before) is not None]

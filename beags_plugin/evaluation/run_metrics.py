@@ -1,4 +1,4 @@
-"""Scores of the objects that a labelled scene yields: masks, removals, PSNR, SSIM (method, section 8)."""
+"""Scores of a labelled scene and its objects: masks, removals, PSNR, SSIM (method, section 8)."""
 
 from __future__ import annotations
 
@@ -31,8 +31,14 @@ from beags_plugin.evaluation.records import (
 )
 from beags_plugin.evaluation.removal import removal_metrics
 from beags_plugin.evaluation.shown import TAU
-from beags_plugin.evaluation.truths import extracted_truth, object_pixels, removals, rendered_truth, seen_truth
-from beags_plugin.labels.class_ids import resize_nearest
+from beags_plugin.evaluation.truths import (
+    extracted_truth,
+    object_pixels,
+    removals,
+    rendered_truth,
+    resized,
+    seen_truth,
+)
 from beags_plugin.losses.photometric import ssim
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth, surfel_inputs
@@ -54,14 +60,14 @@ def evaluate_scene(
     shown: Sequence[Tensor] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> SceneMetrics:
-    """Return the figures of each object's masks and of the scene without it, PSNR and SSIM (method, section 8).
+    """Return the metrics of the masks and removals of each object, and of the images (method, section 8).
 
-    surfels: N Gaussians. members: of them; None scores images alone. classes: id to name; the background, 0, is not
-    scored. complete: False where Gaussians were taken out of the scene, so that only extracted masks can be
-    scored. objects_alone: the scene was trained on nothing but objects: of images, only their pixels are scored.
-    colors_fitted: the scene has learned exposures of photos, so its colours are brought to each photo by one fit of the
-    whole rendering; PSNR shown, PSNR objects and removals are taken after it.
-    background: [3] behind the images; black if None. shown: per view [H, W] bool, see ``shown_pixels``.
+    surfels: N Gaussians. members: their classes; None scores images only. classes: id to name; the background, 0, is
+    not scored. complete: False if Gaussians were removed from the scene, so that only extracted masks can be scored.
+    objects_alone: the scene was trained on objects only; only their pixels of images are scored. colors_fitted: the
+    scene has learned exposures of photos; its colours are fitted to each photo by one affine map of the whole
+    rendering, and PSNR shown, PSNR objects and removals are taken after that. background: [3] behind the images; black
+    if None. shown: per view [H, W] bool, see ``shown_pixels``.
     progress: receives (done, total) views.
     """
     protocol = protocol or Protocol()
@@ -87,7 +93,7 @@ def evaluate_scene(
                 color, photo = renderer.image(surfels, background), view.image.to(surfels.means)
                 if (of_objects := object_pixels(view)) is not None:
                     of_objects = of_objects.to(color.device)
-                # What is drawn outside of objects that were trained alone has no colour of the photo.
+                # Outside of objects that were trained alone, the rendering does not have the colours of the photo.
                 affine = affine_color_fit(color, photo, of_objects if objects_alone else None)
                 if not objects_alone:
                     fitted = psnr(fitted_colors(color, affine), photo)
@@ -106,14 +112,14 @@ def evaluate_scene(
                         mask, band = near.masks("extracted", [class_id])[class_id], band_of(view, protocol.band_share)
                         agreement = mask_metrics(mask.prediction, mask.truth, mask.ignore, protocol, band)
                         drawn = near.image(surfels, background)
-                        if colors_fitted:  # The fit of the whole photo, as above.
+                        if colors_fitted:  # The fit is that of the whole photo.
                             drawn = fitted_colors(drawn, affine).to(drawn)
                         metrics = close_up_metrics(part, class_id, drawn, agreement)
                         masks.append(MaskRecord("close_up", class_id, index, mask.source, metrics))
                 for class_id, exact, silhouette, known in removals(view, [] if objects_alone else objects):
                     assert members is not None
                     rest = renderer.image(remove_class(surfels, members, class_id)[0], background)
-                    if colors_fitted:  # The fit is that with the object: one of its own would hide what remains.
+                    if colors_fitted:  # The fit is that with the object: a fit of its own would hide remains.
                         rest = fitted_colors(rest, affine).to(rest)
                     known = None if known is None else known.to(rest.device)
                     metrics = removal_metrics(rest, photo, exact.to(rest), silhouette.to(rest.device), known)
@@ -127,7 +133,7 @@ def evaluate_scene(
         return mean_metrics(r.metrics for r in masks if r.kind == kind and r.class_id == class_id)
 
     return SceneMetrics(
-        mean=ObjectMetrics(**{kind: average(masks, kind, protocol) for kind in KINDS}),
+        mean=ObjectMetrics(**{kind: pooled_average({0: masks}, kind, protocol) for kind in KINDS}),
         objects={c: ObjectMetrics(**{kind: of_object(c, kind) for kind in KINDS}) for c in objects},
         extracted_truth="both" if len(truths) == 2 else next(iter(truths), None),
         masks=tuple(masks),
@@ -145,18 +151,13 @@ def fitted_colors(rendered: Tensor, affine: Tensor) -> Tensor:
 def psnr_after_fit(rendered: Tensor, photo: Tensor) -> float:
     """Return the PSNR in dB of a rendering after its best affine colour fit to the photo, clamped to 0..1.
 
-    rendered, photo: [H, W, 3] float in 0..1. A difference of exposure or white balance alone costs nothing.
+    rendered, photo: [H, W, 3] float in 0..1. Differences in exposure or white balance alone do not count.
     """
     return psnr(fitted_colors(rendered, affine_color_fit(rendered, photo)), photo)
 
 
-def average(masks: Iterable[MaskRecord], kind: Kind, protocol: Protocol, scene: Hashable = 0) -> Any:
-    """Return the mean of one kind of metrics over a scene; None without any."""
-    return pooled_average({scene: masks}, kind, protocol)
-
-
 def pooled_average(scenes: Mapping[Hashable, Iterable[MaskRecord]], kind: Kind, protocol: Protocol) -> Any:
-    """Return the mean of one kind of metrics of several scenes, as if they were one scene; None without any."""
+    """Return the mean of one kind of metrics over one scene, or several as if they were one; None without any."""
     groups: dict[Hashable, list[Any]] = {}
     for scene, masks in scenes.items():
         for record in masks:
@@ -168,9 +169,9 @@ def pooled_average(scenes: Mapping[Hashable, Iterable[MaskRecord]], kind: Kind, 
 
 @dataclass(frozen=True)
 class RenderedMask:
-    """A predicted mask [H, W] bool and its truth [h, w] bool, as ``Truth.compared`` gives it.
+    """A predicted mask [H, W] bool and its truth [h, w] bool, a result of ``Truth.compared``.
 
-    ignore: [h, w] bool, pixels that do not count, or None. source: as of ``Truth``.
+    ignore: [h, w] bool, pixels that do not count, or None. source: as in ``Truth``.
     """
 
     prediction: Tensor
@@ -192,13 +193,13 @@ class MaskRenderer:
     _alone: dict[int, tuple[Tensor, Tensor | None]] = field(default_factory=dict)
 
     def image(self, surfels: Surfels, background: Tensor) -> Tensor:
-        """Return [H, W, 3] in 0..1, an image of all or some of the scene's Gaussians."""
+        """Return an image [H, W, 3] in 0..1 of all or some of the scene's Gaussians."""
         camera = self.view.camera
         inputs = surfel_inputs(surfels, camera)
         return self.rasterizer.rasterize(inputs, camera, self.settings, background).color.clamp(0, 1)
 
     def masks(self, kind: MaskKind, objects: Sequence[int]) -> dict[int, RenderedMask]:
-        """Return object id to its mask, for those of ``objects`` that the view has a truth of."""
+        """Return object id to its mask, for the objects of which the view has a truth."""
         if self.members is None or not objects:
             return {}
         if kind == "rendered":
@@ -207,21 +208,21 @@ class MaskRenderer:
             return {
                 c: RenderedMask(mask, known[c].compared(), known[c].unknown, "visible") for c, mask in rendered.items()
             }
-        found = {}
+        masks = {}
         for class_id in objects:
             truth = extracted_truth(self.view, class_id) if kind == "extracted" else seen_truth(self.view, class_id)
             if truth is not None:
                 mask, hidden = self._extracted(self.members, class_id, truth.others)
                 left_out = [pixels for pixels in (truth.unknown, hidden) if pixels is not None]
                 ignore = torch.stack(left_out).any(dim=0) if left_out else None
-                found[class_id] = RenderedMask(mask, truth.compared(), ignore, truth.source)
-        return found
+                masks[class_id] = RenderedMask(mask, truth.compared(), ignore, truth.source)
+        return masks
 
     def _extracted(self, members: Membership, class_id: int, others: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Return [H, W] bool, alpha of the object alone above the threshold; and which of ``others`` may hide it.
+        """Return [H, W] bool, alpha of the object alone above the threshold, and the ``others`` that may hide it.
 
-        A pixel of another object tells nothing about what lies behind it, by more than ``TAU`` of the depth; what is
-        drawn before it, in it, or by the whole scene instead of it is wrong.
+        Behind a pixel of another object, by more than ``TAU`` of the depth, the truth is unknown. The object is wrong
+        there if it is rendered in front of the other one, inside it, or by the whole scene in its place.
         """
         if class_id not in self._alone:
             part = select_class(self.surfels, members, class_id)[0]
@@ -232,13 +233,13 @@ class MaskRenderer:
             if others is not None:
                 nearer = self._scene_depth < (1.0 - TAU) * surface_depth(render, "median")
                 nearer &= ~self._rendered(members, [class_id])[class_id]
-                hidden = others & torch.from_numpy(resize_nearest(nearer.cpu().numpy(), *others.shape))
+                hidden = others & resized(nearer.cpu(), *others.shape)
             self._alone[class_id] = render.alpha > self.protocol.threshold, hidden
         return self._alone[class_id]
 
     @cached_property
     def _scene_depth(self) -> Tensor:
-        """Return [H, W], the depth of the surface that the whole scene shows, 0 where none."""
+        """Return [H, W], the median depth of the whole scene, 0 without a surface."""
         return surface_depth(self._render(self.surfels, depth=True), "median")
 
     def _render(self, surfels: Surfels, depth: bool) -> RasterOutputs:

@@ -1,4 +1,4 @@
-"""Which pixels of held-out views show surface that some training photo shows."""
+"""Pixels of held-out views whose surface some training photo shows."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def shown_pixels(
     training: Sequence[Camera],
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Tensor]:
-    """Return for each held-out view [H, W] bool: the pixels whose surface lies in some training view, unhidden.
+    """Return [H, W] bool for each held-out view: the pixels whose surface is visible in some training view.
 
-    The surface is the median depth of the scene; a pixel without one is not shown. settings: must ask for geometry.
-    progress: receives (done, total) training views. Every view is rendered once; of training views, one is held.
+    The surface is the median depth of the scene; a pixel without one is not shown. settings: with geometry.
+    progress: receives (done, total) training views. Every view is rendered once; one training view is held at a time.
     """
     depths = list(render_depths(surfels.detach(), held_out, rasterizer, settings, "median"))
     shown = [torch.zeros_like(depth, dtype=torch.bool) for depth in depths]
@@ -34,10 +34,10 @@ def shown_pixels(
     surfaces = render_depths(surfels.detach(), training, rasterizer, settings, "median", progress)
     for index, surface in enumerate(surfaces, start=len(held_out)):
         height, width = surface.shape
-        for depth, found, A, b in zip(depths, shown, *maps.towards(index), strict=False):
-            rows, columns = torch.nonzero((depth > 0) & ~found, as_tuple=True)
+        for depth, mask, A, b in zip(depths, shown, *maps.towards(index), strict=False):
+            rows, columns = torch.nonzero((depth > 0) & ~mask, as_tuple=True)
             far = depth[rows, columns]
             x, y = columns.to(far) + 0.5, rows.to(far) + 0.5
             lands, pixel, z = landing(x, y, far, (A, b), (width, height), far > 0)
-            found[rows[lands], columns[lands]] = (z - surface.reshape(-1)[pixel]).abs() <= TAU * z
+            mask[rows[lands], columns[lands]] = (z - surface.reshape(-1)[pixel]).abs() <= TAU * z
     return shown

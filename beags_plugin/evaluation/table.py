@@ -18,7 +18,7 @@ _HEADINGS = {"acc": "Acc", "iou": "IoU", "biou": "BIoU", "psnr": "PSNR", "ssim":
 _HEADINGS |= {"psnr_shown": "shown", "shown": "pixels", "spill": "spill"}
 _IN_IMAGES = {"psnr": "\nPSNR", "psnr_fit": "after\ncolour fit", "psnr_shown": "\nshown", "psnr_objects": "\nobjects"}
 _IN_IMAGES |= {"ssim": "\nSSIM"}
-_STAGE_NAMES = {"before": "assigned", "after": "refined"}  # in summary.json
+_STAGE_NAMES = {"before": "assigned", "after": "refined"}  # names in summary.json
 _Row = tuple[str, Mapping[str, Any], Mapping[str, Any] | None]
 """A row's name, its metrics {kind: {stage: {metric: value}}}, and its ``IMAGE_FIGURES`` or None."""
 _TRUTHS = {
@@ -29,9 +29,9 @@ _TRUTHS = {
 
 
 def summary_json(run: RunMetrics, seconds: Mapping[str, float], peak_memory_mb: float) -> dict[str, Any]:
-    """Return the summary of one run as plain values for ``json.dump``; a missing or infinite figure is None.
+    """Return the summary of one run as plain values for ``json.dump``; a missing or infinite metric is None.
 
-    seconds: stage to wall time. peak_memory_mb: of the whole process, MB of 10^6 bytes. {"mean": {"extracted":
+    seconds: stage to wall time. peak_memory_mb: peak of the whole process, MB of 10^6 bytes. {"mean": {"extracted":
     {"assigned": {"acc", "iou", "biou", "spill"}, "refined": {...}}, ...}, "objects": {name: as mean}, "psnr":
     {"before", "after"}, "seconds": {stage: s}, "peak_memory_mb": n}.
     """
@@ -52,7 +52,7 @@ def summary_json(run: RunMetrics, seconds: Mapping[str, float], peak_memory_mb: 
 def render_run(
     run: RunMetrics, seconds: Mapping[str, float] | None = None, peak_memory_mb: float = 0
 ) -> RenderableType:
-    """Return tables of one run, masks and removals per object and stage, then PSNR, SSIM, seconds, memory and notes."""
+    """Return tables of one run per object and stage, then PSNR, SSIM, seconds, memory and notes."""
     from rich.console import Group
     from rich.text import Text
 
@@ -62,8 +62,7 @@ def render_run(
         rows = [(name, row, None) for name, row in content["objects"].items()]
         rows.append(("mean", content["mean"], None))
         parts.append(_mask_table(run.scene, "object", [*rows, *_worst(content)], stages))
-        parts += _removal_table(run.scene, "object", rows, stages)
-        parts += _close_up_table(run.scene, "object", rows, stages)
+        parts += _more_tables(run.scene, "object", rows, stages)
     else:
         parts.append(Text(run.scene))
     lines = []
@@ -94,13 +93,12 @@ def render_data_set(found: DataSetMetrics) -> RenderableType:
         scenes.append([(run.scene, scene["mean"], scene), *_worst(scene)])
     scenes.append([(found.name, content["mean"], content)])
     table = _mask_table("All scenes", "scene", [row for scene in scenes for row in scene], stages)
-    removal = _removal_table("All scenes", "scene", [scene[0] for scene in scenes], stages)
-    near = _close_up_table("All scenes", "scene", [scene[0] for scene in scenes], stages)
-    return Group(table, *removal, *near, Text(protocol_line(found.runs)))
+    more = _more_tables("All scenes", "scene", [scene[0] for scene in scenes], stages)
+    return Group(table, *more, Text(protocol_line(found.runs)))
 
 
 def protocol_line(runs: Sequence[RunMetrics]) -> str:
-    """Return a sentence with all choices behind the figures of runs of one protocol."""
+    """Return a sentence with all choices behind the scores of runs of one protocol."""
     return protocol_sentence(
         runs[0].protocol,
         [run.after.extracted_truth for run in runs],
@@ -113,9 +111,9 @@ def protocol_line(runs: Sequence[RunMetrics]) -> str:
 def protocol_sentence(
     protocol: Protocol, truths: Iterable[str | None], *, removal: bool, shown: bool, fitted: bool
 ) -> str:
-    """Return a sentence with all choices behind figures.
+    """Return a sentence with all choices behind scores.
 
-    truths: of each scene, as ``SceneMetrics.extracted_truth``. removal, shown: whether there are such figures. fitted:
+    truths: ``SceneMetrics.extracted_truth`` of each scene. removal, shown: whether there are such metrics. fitted:
     whether a run has learned exposures.
     """
     known = {truth for truth in truths if truth is not None}
@@ -149,38 +147,29 @@ def protocol_sentence(
 
 
 def _worst(run: Mapping[str, Any]) -> list[_Row]:
-    """Return the row of the object with the lowest extracted BIoU; none for a single object."""
+    """Return the row of the object with the lowest extracted BIoU; no row for a single object."""
     name = run["worst"]
     return [] if name is None or len(run["objects"]) < 2 else [(f"worst: {name}", run["objects"][name], None)]
 
 
-def _meaning(stages: Sequence[Stage]) -> str:
-    return " (before: assignment alone; after: after refinement)" if len(stages) == 2 else ""
-
-
 def _mask_table(what: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> RenderableType:
-    """Return rows of all kinds of mask metrics per stage, with PSNR and SSIM if any row has images."""
-    # What is covered stands in files alone: one column more is too many for a terminal.
+    """Return a table of all kinds of mask metrics per stage, with PSNR and SSIM if any row has images."""
+    # The metric covered is in files only: one more column is too many for a terminal.
     columns = [(kind, metric) for kind in MASK_KINDS for metric in FIGURES[kind] if metric != "covered"]
     columns = [c for c in columns if c[0] != "seen" or (c[1] in ("iou", "biou") and _known(rows, stages, *c))]
-    return _table(f"{what}: masks, %{_meaning(stages)}", first, rows, stages, columns)
+    meaning = " (before: assignment alone; after: after refinement)" if len(stages) == 2 else ""
+    return _table(f"{what}: masks, %{meaning}", first, rows, stages, columns)
 
 
-def _removal_table(what: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> Iterator[RenderableType]:
-    """Yield a table of what is left after removal, if any row has that."""
+def _more_tables(what: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> Iterator[RenderableType]:
+    """Yield a table of removals and one of close-ups, each if any row has such metrics."""
+    plain = [(name, row, None) for name, row, _ in rows]
     if _known(rows, stages, "removal", "psnr"):
         columns = [("removal", m) for m in FIGURES["removal"] if "shown" not in m or _known(rows, stages, "removal", m)]
-        plain = [(name, row, None) for name, row, _ in rows]
-        yield _table(
-            f"{what}: objects removed, PSNR in dB, pixels shown and remains in %", first, plain, stages, columns
-        )
-
-
-def _close_up_table(what: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> Iterator[RenderableType]:
-    """Yield a table of objects at the size of the photos' files, if any row has that."""
-    if any(_known(rows, stages, "close_up", metric) for metric in FIGURES["close_up"]):
-        columns = [("close_up", metric) for metric in FIGURES["close_up"]]
-        plain = [(name, row, None) for name, row, _ in rows]
+        title = f"{what}: objects removed, PSNR in dB, pixels shown and remains in %"
+        yield _table(title, first, plain, stages, columns)
+    columns = [("close_up", metric) for metric in FIGURES["close_up"]]
+    if any(_known(rows, stages, *column) for column in columns):
         yield _table(f"{what}: objects at the photos' own size, PSNR in dB, masks in %", first, plain, stages, columns)
 
 

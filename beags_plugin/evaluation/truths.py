@@ -1,4 +1,4 @@
-"""What is true of the objects in a held-out view: the masks to compare with, and the pixels that count."""
+"""Ground truth of the objects in a held-out view: the masks to compare with, and the pixels that count."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from beags_plugin.labels.class_ids import IGNORE, resize_nearest
 
 @dataclass(frozen=True)
 class Truth:
-    """The mask of an object in a view, [h, w] bool, and pixels of that size that may not count.
+    """The mask of an object in a view and pixels that may not count, all [h, w] bool.
 
-    source: "silhouette" or "visible". unknown: pixels that count nowhere, or None. others: pixels that are or may be
-    other objects', which count unless their object hides this one, or None.
+    source: "silhouette" or "visible". unknown: pixels that do not count, or None. others: pixels that may belong to
+    other objects and count unless their object hides this one, or None.
     """
 
     source: str
@@ -27,12 +27,12 @@ class Truth:
     others: Tensor | None = None
 
     def compared(self) -> Tensor:
-        """Return [h, w] bool, the mask with the unknown pixels in it, so that they make no boundary."""
+        """Return the mask with the unknown pixels, [h, w] bool, so that they make no boundary."""
         return self.mask if self.unknown is None else self.mask | self.unknown
 
 
 def rendered_truth(view: EvalView, class_id: int) -> Truth | None:
-    """Return an object's visible mask; None if the view has no mask of it."""
+    """Return the visible mask of an object; None if the view has no mask of it."""
     if view.visible_objects is not None:
         mask = view.visible_objects.get(class_id)
         return None if mask is None else Truth("visible", mask, _of(view.unknown_visible, class_id))
@@ -53,7 +53,7 @@ def extracted_truth(view: EvalView, class_id: int) -> Truth | None:
 
 
 def seen_truth(view: EvalView, class_id: int) -> Truth | None:
-    """Return an object's silhouette, where training photos show it; None unless the data says where."""
+    """Return the parts of an object's silhouette that training photos show; None if the data has no map of them."""
     known = _of(view.seen, class_id)
     if known is None or view.silhouettes is None or class_id not in view.silhouettes:
         return None
@@ -64,34 +64,37 @@ def seen_truth(view: EvalView, class_id: int) -> Truth | None:
 def removals(view: EvalView, objects: Sequence[int]) -> Iterator[tuple[int, Tensor, Tensor, Tensor | None]]:
     """Yield the objects whose removal can be scored: id, exact picture [H, W, 3], silhouette and known part [H, W]."""
     for class_id, exact in (view.removed or {}).items():
-        found = (_of(masks, class_id) for masks in (view.silhouettes, view.removed_shown))
-        silhouette, shown = (
-            None if mask is None else torch.from_numpy(resize_nearest(mask.cpu().numpy(), *exact.shape[:2]))
-            for mask in found
-        )
+        silhouette, shown = _of(view.silhouettes, class_id), _of(view.removed_shown, class_id)
         if class_id in objects and silhouette is not None:
-            yield class_id, exact, silhouette, shown
+            height, width = exact.shape[:2]
+            known = None if shown is None else resized(shown, height, width)
+            yield class_id, exact, resized(silhouette, height, width), known
+
+
+def resized(mask: Tensor, height: int, width: int) -> Tensor:
+    """Return a mask [H, W] at another size by nearest pixel, on the CPU; the mask itself if it has that size."""
+    if mask.shape == (height, width):
+        return mask
+    return torch.from_numpy(resize_nearest(mask.cpu().numpy(), height, width))
 
 
 def object_pixels(view: EvalView) -> Tensor | None:
-    """Return [H, W] bool, the pixels of the photograph inside the objects; None without a mask that says.
+    """Return [H, W] bool, the pixels of the photograph inside the objects; None without masks.
 
-    Those next to the background, which the photograph shows too, are left out.
+    Pixels next to the background are left out, because they mix with it.
     """
     if view.visible_objects is not None:
         masks = list(view.visible_objects.values())
     else:
         masks = [] if view.visible is None else [(view.visible != 0) & (view.visible != IGNORE)]
-    size = view.camera.height, view.camera.width
-    found = [torch.from_numpy(resize_nearest(mask.cpu().numpy(), *size)) for mask in masks]
-    if not found:
+    if not masks:
         return None
-    inside = torch.stack(found).any(dim=0)
+    inside = torch.stack([resized(mask, view.camera.height, view.camera.width) for mask in masks]).any(dim=0)
     return inside & ~at_border(inside.int())
 
 
 def _of_others(view: EvalView, class_id: int) -> Tensor:
-    """Return [h, w] bool: pixels that are or may be other objects', by masks that have the size of this one's."""
+    """Return [h, w] bool: pixels that may belong to other objects, by their masks of the same size."""
     assert view.visible_objects is not None
     others = torch.zeros_like(view.visible_objects[class_id])
     for masks in (view.visible_objects, view.unknown_visible or {}):

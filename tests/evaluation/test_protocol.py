@@ -16,7 +16,7 @@ from beags_plugin.evaluation.metrics import METRICS, MaskMetrics, mask_metrics
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView, MaskRecord, ObjectMetrics, SceneMetrics, ViewRecord
 from beags_plugin.evaluation.report import RunMetrics, data_set
-from beags_plugin.evaluation.run_metrics import average, evaluate_scene
+from beags_plugin.evaluation.run_metrics import evaluate_scene, pooled_average
 from beags_plugin.system.errors import UserError
 
 NO_FIGURES = MaskMetrics(None, None, None)
@@ -156,10 +156,10 @@ def averaged(values: np.ndarray, how: str) -> float:
 def test_the_mean_of_a_scene(how, seed):
     masks = records(seed, 7, 4)
     for kind in ("extracted", "rendered"):
-        found = average(masks, kind, Protocol(scene_average=how))
+        found = pooled_average({0: masks}, kind, Protocol(scene_average=how))
         for metric in METRICS:
             assert getattr(found, metric) == pytest.approx(averaged(table(masks, kind, metric, 7, 4), how))
-    assert average([], "extracted", Protocol(scene_average=how)) is None
+    assert pooled_average({0: []}, "extracted", Protocol(scene_average=how)) is None
 
 
 NOTHING = ObjectMetrics(None, None)
@@ -170,7 +170,7 @@ def run(seed: int, views: int, objects: int, protocol: Protocol, before: bool = 
         masks = records(seed + shift, views, objects)
         generator = np.random.default_rng(seed + shift)
         images = [ViewRecord(f"v{i}", *generator.uniform(0, 40, 2).tolist()) for i in range(views)]
-        kinds = (average(masks, "extracted", protocol), average(masks, "rendered", protocol))
+        kinds = tuple(pooled_average({0: masks}, kind, protocol) for kind in ("extracted", "rendered"))
         psnr, ssim = (math.fsum(getattr(i, name) for i in images) / views for name in ("psnr", "ssim"))
         return SceneMetrics(
             ObjectMetrics(*kinds),

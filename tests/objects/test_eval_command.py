@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -85,7 +86,7 @@ def test_the_json_says_everything(trained, tmp_path):
     main(["eval", "--load-config", str(trained), "--json", str(path), "--csv", str(table), "--threshold", "0.4"])
     content = json.loads(path.read_text(), parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
     assert set(content) == {"data_set", "protocol", "mean", *IMAGE_FIGURES, "scenes"}
-    assert content["protocol"] == Protocol(threshold=0.4).to_json()
+    assert content["protocol"] == asdict(Protocol(threshold=0.4))
     (scene,) = content["scenes"]
     assert set(scene) == {
         "scene", "config", "protocol", "extracted_truth", "colors_fitted", "notes", "mean", *IMAGE_FIGURES, "objects",

@@ -56,7 +56,7 @@ def masks(value: float) -> dict:
 def result(value: float, psnr: float | None = 30.0) -> dict:
     return {
         "evaluation": {
-            "protocol": Protocol(band_share=0.03).to_json(),
+            "protocol": dataclasses.asdict(Protocol(band_share=0.03)),
             "extracted_truth": "silhouette",
             "mean": masks(value),
             "psnr": {"before": 29.0, "after": psnr},
