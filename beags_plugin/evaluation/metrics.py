@@ -141,9 +141,8 @@ def spill(predicted: np.ndarray, true: np.ndarray, counted: np.ndarray, margin: 
     if area == 0:
         return None
     distance = cv2.distanceTransform((~true).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    squared = np.rint(
-        np.square(distance, dtype=np.float64)
-    )  # squared distances are whole numbers, except for OpenCV's rounding of the root
+    # Squared distances between pixels are whole numbers; rint undoes OpenCV's rounding of the root.
+    squared = np.rint(np.square(distance, dtype=np.float64))
     return np.count_nonzero(predicted & counted & (squared > margin**2)) / area
 
 

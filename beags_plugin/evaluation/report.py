@@ -180,7 +180,7 @@ def data_set(name: str, runs: Sequence[RunMetrics]) -> DataSetMetrics:
 
 
 def _comparable(runs: Sequence[RunMetrics], has: Callable[[SceneMetrics], Any]) -> dict[Stage, list[SceneMetrics]]:
-    """Return stage to the scenes with a metric; no "before" if some have only "after": the means would differ in scenes."""
+    """Return stage to the scenes with a metric; no "before" unless all of them have it."""
     found = [run for run in runs if has(run.after) is not None]
     scenes: dict[Stage, list[SceneMetrics]] = {"after": [run.after for run in found]}
     before = [run.before for run in found if run.before is not None and has(run.before) is not None]
