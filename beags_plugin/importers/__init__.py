@@ -1,4 +1,4 @@
-"""Importers of scenes to start from, each a registered component (entry points: ``beags.importers``)."""
+"""Importers of scenes to start from, each registered by name (entry points: ``beags.importers``)."""
 
 from beags_plugin.system.registry import Registry
 

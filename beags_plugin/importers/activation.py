@@ -1,7 +1,7 @@
-"""Scales and opacities that a program wrote after activation: lengths instead of logs, 0..1 instead of logits.
+"""Detection of scales and opacities written after activation: lengths instead of logs, 0..1 instead of logits.
 
-No specification of splat .ply files forbids it. The ranges tell: logits of a trained scene leave 0..1, and logs of
-scales are negative below one unit of length.
+No specification of splat .ply files forbids that. The value ranges show it: logits of a trained scene exceed 0..1, and
+logs of scales below one unit of length are negative.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from beags_plugin.system.errors import UserError
 
 StartValues = Literal["auto", "logs", "activated"]
 
-_ENOUGH = 32  # Gaussians of which the opacities alone tell something
-_SAMPLE = 4096  # Gaussians whose nearest neighbours are looked for
-_FITTING = (0.02, 50.0)  # the median scale over the median distance to the nearest neighbours of trained scenes
-_MOST_LOGIT = 40.0  # of an opacity that differs from 1 in double precision
+_ENOUGH = 32  # different opacities whose range is no accident
+_SAMPLE = 4096  # Gaussians whose nearest neighbours are searched
+_FITTING = (0.02, 50.0)  # bounds of median scale / median distance to the nearest neighbour in trained scenes
+_MOST_LOGIT = 40.0  # larger logits give an opacity of 1 in double precision
 _SPREAD = 0.3  # least standard deviation of the logs of a trained scene's scales
-_THINNEST = 1e-12  # units of length: of scales that are 0, as writers of discs leave the third
+THINNEST = 1e-12  # units of length; stands for scales of 0, such as the third of discs
 
 
 def stored_values(path: Path, gaussians: Gaussians, values: StartValues) -> tuple[Gaussians, tuple[str, ...]]:
     """Return the Gaussians with logs of scales and logits of opacities, and sentences on what was converted.
 
-    gaussians: N, their scales and opacities as they stand in ``path``. Raises ``UserError`` where ``values`` is "auto"
-    and the ranges fit both, or neither.
+    gaussians: N, with scales and opacities as in ``path``. Raises ``UserError`` if ``values`` is "auto" and the ranges
+    fit both or neither.
     """
     if values == "logs":
         return gaussians, ()
@@ -42,18 +42,18 @@ def stored_values(path: Path, gaussians: Gaussians, values: StartValues) -> tupl
         _check_opacities(path, gaussians)
         opacities = _opacities_activated(gaussians)
         scales = _scales_activated(path, gaussians, opacities)
-        opacities = opacities and (scales or _tells_much(gaussians.opacity_logits))
-    found = " and ".join(name for name, there in (("scales", scales), ("opacities", opacities)) if there)
-    if not found:
+        opacities = opacities and (scales or len(_finite(gaussians.opacity_logits).unique()) >= _ENOUGH)
+    converted = " and ".join(name for name, active in (("scales", scales), ("opacities", opacities)) if active)
+    if not converted:
         return gaussians, ()
     if scales:
-        gaussians = replace(gaussians, log_scales=gaussians.log_scales.clamp_min(_THINNEST).log())
+        gaussians = replace(gaussians, log_scales=gaussians.log_scales.clamp_min(THINNEST).log())
     if opacities:
         gaussians = replace(gaussians, opacity_logits=torch.logit(gaussians.opacity_logits.clamp(0.0, 1.0)))
     if values == "activated":
         return gaussians, ()
     return gaussians, (
-        f"Its {found} lie where activated values do, so they are converted "
+        f"Its {converted} lie where activated values do, so they are converted "
         "(--pipeline.model.start-values logs takes them as logs and logits).",
     )
 
@@ -63,7 +63,7 @@ def _finite(values: Tensor) -> Tensor:
 
 
 def _check_opacities(path: Path, gaussians: Gaussians) -> None:
-    """Raise ``UserError`` for opacities in percent or of 255."""
+    """Raise ``UserError`` for opacities in percent or in 0..255."""
     values = _finite(gaussians.opacity_logits)
     if len(values) and bool((values >= 0).all()) and float(values.max()) > _MOST_LOGIT:
         raise UserError(
@@ -78,17 +78,12 @@ def _opacities_activated(gaussians: Gaussians) -> bool:
     return len(values) > 0 and bool(((values >= 0) & (values <= 1)).all())
 
 
-def _tells_much(values: Tensor) -> bool:
-    """Return whether there are so many different values that their range is no accident."""
-    return len(_finite(values).unique()) >= _ENOUGH
-
-
 def _scales_activated(path: Path, gaussians: Gaussians, opacities: bool) -> bool:
     """Return whether the scales are lengths; opacities: whether the opacities may be activated.
 
-    All logs of a scene are positive where its unit is far smaller than its Gaussians, such as the millimetre. Lengths
-    are then told from logs by the distances between neighbours, which Gaussians are about as large as, and as sizes
-    differ: small lengths taken as logs would make all Gaussians as large as one another, and round.
+    All logs of a scene are positive if its unit is far smaller than its Gaussians, such as the millimetre. Two
+    properties then tell lengths from logs: Gaussians are about as large as the distances between neighbours, and their
+    sizes differ, while small lengths taken as logs would give round Gaussians of equal size.
     """
     values = _finite(gaussians.log_scales)
     if len(values) == 0 or bool((values < 0).any()):
@@ -99,7 +94,7 @@ def _scales_activated(path: Path, gaussians: Gaussians, opacities: bool) -> bool
     if not apart > 0:
         return False
     fits = {}
-    for kind, logs in (("lengths", gaussians.log_scales.clamp_min(_THINNEST).log()), ("logs", gaussians.log_scales)):
+    for kind, logs in (("lengths", gaussians.log_scales.clamp_min(THINNEST).log()), ("logs", gaussians.log_scales)):
         middle = float(_finite(logs[:, :2].amax(dim=1)).median())
         near = _FITTING[0] < math.exp(min(middle, 700.0)) / apart < _FITTING[1]
         fits[kind] = near and float(_finite(logs[:, :2]).std()) > _SPREAD
@@ -112,7 +107,7 @@ def _scales_activated(path: Path, gaussians: Gaussians, opacities: bool) -> bool
 
 
 def _spacing(means: Tensor) -> float:
-    """Return the median distance from a Gaussian to its nearest other one; 0 where there are fewer than two."""
+    """Return the median distance from a Gaussian to its nearest neighbour; 0 for fewer than two."""
     from scipy.spatial import KDTree
 
     points = means[means.isfinite().all(dim=1)].double().cpu().numpy()

@@ -1,4 +1,4 @@
-"""The interface of importers, which read a scene that another program, or another run, has trained."""
+"""The interface of importers, which read a scene that another program or another run has trained."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ _OTHERS: dict[str, Callable[[Path], str]] = {
     ".zip": lambda path: command(["unzip", path]),
     ".7z": lambda path: command(["7z", "x", path]),
 }
-"""Commands of other programs that turn formats which no importer reads into one of those that are read."""
-_CHECKPOINTS = (".pt", ".pth")  # of gsplat's examples and of 3DGS, which write .ply files too
+"""Commands of other programs that convert formats without an importer."""
+_CHECKPOINTS = (".pt", ".pth")  # gsplat's examples and 3DGS write these beside a .ply
 
 
 @dataclass(frozen=True)
 class ImportedScene:
     """A scene as a file holds it.
 
-    kind: its name for users, as in "3DGS .ply". gaussians: N, flat or with volume; not yet checked for odd values.
-    normalization: None if the file lies in the world of the input poses; else ([3, 4] float64 R | t, scale) of the
-    frame x' = scale (R x + t) that it lies in.
-    note: a sentence that the user should read if the scene is taken to lie in this run's own frame, or "".
-    remarks: other sentences for the user: what the format has lost, and what was assumed.
-    free_values: whether no specification says what scales and opacities are, and some programs write them activated.
-    exact_means: [N, 3] float64, the means where they lie so far from 0 that single precision tears them; else None.
-    doubtful_axes: whether programs disagree on the axes of the format, so that the scene may be a quarter turned.
+    kind: its name for users, such as "3DGS .ply". gaussians: N, flat or with volume, not yet checked for odd values.
+    normalization: None if the scene lies in the world of the input poses; else ([3, 4] float64 R | t, scale) of its
+    frame x' = scale (R x + t).
+    note: a sentence for the user if the scene is assumed to lie in this run's own frame, or "".
+    remarks: other sentences for the user: what the format loses and what was assumed.
+    free_values: whether the format does not specify scales and opacities, so that some programs write them activated.
+    exact_means: [N, 3] float64, the means if they lie too far from 0 for single precision; else None.
+    doubtful_axes: whether programs disagree on the axes of the format, so that the scene may be rotated by 90 degrees.
     """
 
     kind: str
@@ -59,17 +59,17 @@ class Importer(ABC):
 
     @abstractmethod
     def recognises(self, path: Path) -> bool:
-        """Return whether to take the existing ``path`` where the user named no importer; reads as little as it can."""
+        """Return whether this importer reads the existing ``path``; looks at as little of it as possible."""
 
     @abstractmethod
     def read(self, path: Path) -> ImportedScene:
-        """Read the scene in float32. Raises ``UserError`` if it cannot be read, is damaged, or is something else."""
+        """Read the scene in float32; raises ``UserError`` if it cannot be read, is damaged, or is something else."""
 
 
 def find_importer(path: Path) -> Importer:
     """Return the importer that recognises ``path``.
 
-    Raises ``UserError`` if there is no ``path``, no such importer, or none or several that take ``path``.
+    Raises ``UserError`` if ``path`` does not exist, or if no importer or several recognise it.
     """
     from beags_plugin.importers import IMPORTERS
 
@@ -90,10 +90,10 @@ def find_importer(path: Path) -> Importer:
 
 
 def read_scene(path: Path, values: StartValues = "auto") -> ImportedScene:
-    """Read the scene that ``path`` holds, its scales as logs and its opacities as logits, whatever its writer made.
+    """Read the scene of ``path`` with scales as logs and opacities as logits, whichever the file has.
 
-    values: what they are in the file; "auto": what their ranges say. Raises ``UserError`` as ``find_importer`` and
-    ``Importer.read``, and where the ranges say nothing.
+    values: what the file has; "auto" decides by their ranges. Raises ``UserError`` like ``find_importer`` and
+    ``Importer.read``, and if the ranges are ambiguous.
     """
     scene = find_importer(path).read(path)
     if scene.free_values:

@@ -15,7 +15,7 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.tensors import load_tensors
 from beags_plugin.system.reading.text import load_json, reason
 
-_TRANSFORM = "dataparser_transforms.json"  # nerfstudio's name for how the poses were normalised
+_TRANSFORM = "dataparser_transforms.json"  # nerfstudio's file with the normalisation of poses
 _PREFIX = "_model.gauss_params."
 
 
@@ -45,13 +45,13 @@ class CheckpointImporter(Importer):
 
 
 def _newest(path: Path) -> Path | None:
-    """Return the checkpoint that ``path`` means: itself, or the newest of a run; None if it means none."""
+    """Return ``path`` if it is a checkpoint, or the newest checkpoint of a run; None for others."""
     if path.is_file() and path.suffix == ".ckpt":
         return path
     run = path.parent if path.name == "config.yml" else path
     for folder in (run, run / "nerfstudio_models"):
-        if found := sorted(folder.glob("step-*.ckpt")):
-            return found[-1]
+        if checkpoints := sorted(folder.glob("step-*.ckpt")):
+            return checkpoints[-1]
     return None
 
 
@@ -69,28 +69,28 @@ def _normalization(file: Path) -> tuple[Tensor, float] | None:
 
 
 def _gaussians(checkpoint: Path) -> Gaussians:
-    """Read the Gaussians of a checkpoint: tensors only, from a file that is mapped into memory."""
+    """Read the Gaussians of a checkpoint from a file that is mapped into memory; nothing but tensors is loaded."""
     try:
         content = load_tensors(checkpoint, mmap=True)
         if not isinstance(content, dict) or not isinstance(content.get("pipeline"), dict):
             raise ValueError("it holds no pipeline")
         state = content["pipeline"]
-        found = {name[len(_PREFIX) :]: value for name, value in state.items() if name.startswith(_PREFIX)}
+        parameters = {name[len(_PREFIX) :]: value for name, value in state.items() if name.startswith(_PREFIX)}
     except OSError as error:
         raise UserError(f"{checkpoint} cannot be read ({error.strerror}): name an existing checkpoint.") from error
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise UserError(f"{checkpoint} is not a checkpoint of nerfstudio ({reason(error)}): name another.") from error
-    tensors = _checked(checkpoint, found)
+    tensors = _checked(checkpoint, parameters)
     dc, rest, scales = tensors["features_dc"], tensors["features_rest"], tensors["scales"]
     if scales.shape[1] == 3 and rest.shape[1] == 0:
-        # splatfacto without bands optimises logits of the colour
+        # splatfacto without higher bands optimises logits of the colour
         dc = (torch.sigmoid(dc) - 0.5) / sh_basis(torch.tensor([[0.0, 0.0, 1.0]]), 0)
     return Gaussians(tensors["means"], tensors["quats"], scales, tensors["opacities"][:, 0], dc, rest)
 
 
-def _checked(checkpoint: Path, found: dict[str, Any]) -> dict[str, Tensor]:
-    """Copy the tensors to float32; raise ``UserError`` for shapes that do not fit together or into the file."""
-    means = found.get("means")
+def _checked(checkpoint: Path, parameters: dict[str, Any]) -> dict[str, Tensor]:
+    """Copy the tensors to float32; raises ``UserError`` for shapes that do not fit together or into the file."""
+    means = parameters.get("means")
     count = means.shape[0] if isinstance(means, Tensor) and means.dim() == 2 else -1
     shapes: dict[str, tuple[tuple[int, ...], ...]] = {
         "means": ((3,),),
@@ -103,12 +103,12 @@ def _checked(checkpoint: Path, found: dict[str, Any]) -> dict[str, Tensor]:
     size = checkpoint.stat().st_size
     tensors = {}
     for name, allowed in shapes.items():
-        value = found.get(name)
+        value = parameters.get(name)
         if not isinstance(value, Tensor) or not value.is_floating_point():
             raise UserError(f"{checkpoint} holds no splatfacto or beags scene: it has no gauss_params.{name}.")
         if tuple(value.shape[:1]) != (count,) or tuple(value.shape[1:]) not in allowed:
             raise UserError(f"{checkpoint} is damaged: gauss_params.{name} is {list(value.shape)}.")
-        if value.numel() * value.element_size() > size:  # a view of few numbers as many
+        if value.numel() * value.element_size() > size:  # an expanded view of few numbers
             raise UserError(f"{checkpoint} is damaged: gauss_params.{name} is larger than the file.")
         tensors[name] = value.to(torch.float32, copy=True).contiguous()
     return tensors

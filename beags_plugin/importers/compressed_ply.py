@@ -1,7 +1,8 @@
-"""PlayCanvas' compressed .ply, read as its engine's documentation describes it.
+"""Importer of PlayCanvas' compressed .ply (documentation of the PlayCanvas engine).
 
-The elements: "chunk", the least and greatest values of 256 Gaussians each; "vertex", their places in between, packed
-into four 32-bit words; and "sh", a byte a coefficient of the higher bands. Older files have no ranges of colours.
+Its elements are "chunk", the least and greatest values of 256 Gaussians each; "vertex", values relative to these,
+packed into four 32-bit words; and "sh", one byte for each coefficient of the higher bands. Older files have no ranges
+of colours.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def _header(path: Path) -> bytes:
 
 
 class CompressedPlyImporter(Importer):
-    """In the world of the input poses, as other .ply files."""
+    """Compressed .ply files, in the world of the input poses like other .ply files."""
 
     marks: ClassVar[str] = "a compressed .ply"
 
@@ -80,7 +81,7 @@ class CompressedPlyImporter(Importer):
 
 
 def _parts(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
-    """Return the shares 0..1 [N, parts] that words [N] hold, so many bits each, the first in the highest."""
+    """Return the values 0..1 [N, parts] packed into words [N]; bits: widths of the parts, from the highest."""
     shift, parts = sum(bits), []
     for width in bits:
         shift -= width
@@ -89,7 +90,7 @@ def _parts(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
 
 
 def _between(chunk: np.ndarray, of: np.ndarray, places: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    """Return values [N, 3] at ``places`` between the ends that the Gaussians' chunks ``of`` [N] have for them."""
+    """Return values [N, 3] at ``places`` in 0..1 between the ends of the Gaussians' chunks ``of`` [N]."""
     low, high = (
         np.stack([chunk[f"{end}_{name}"].astype(np.float64) for name in names], axis=1)[of] for end in ("min", "max")
     )

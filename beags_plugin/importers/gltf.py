@@ -1,7 +1,7 @@
-"""glTF 2.0 with KHR_gaussian_splatting, as .glb or .gltf.
+"""Importer of glTF 2.0 with KHR_gaussian_splatting, as .glb or .gltf.
 
-All primitives of Gaussians in the scene are taken, each where its nodes put it. glTF has y up: the scene is turned back
-to z up, as ours were, and those of PlayCanvas' program from the frame to which it turns .ply files.
+All primitives of Gaussians in the scene are read and moved by their nodes. glTF has y up: scenes are turned to z up,
+and files of PlayCanvas' splat-transform back to the axes of the .ply files that it read.
 """
 
 from __future__ import annotations
@@ -19,14 +19,12 @@ import torch
 
 from beags_plugin.core.flattening import Gaussians
 from beags_plugin.importers.base import ImportedScene, Importer
-from beags_plugin.importers.packed import gaussians_of, in_world, moved_by, reading
+from beags_plugin.importers.packed import Z_UP, gaussians_of, in_world, log_lengths, moved_by, reading
 
 EXTENSION = "KHR_gaussian_splatting"
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-_DEEPEST = 64  # nodes below one another
-_THINNEST = 1e-12  # units of length: of scales that are 0
-_Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
+_DEEPEST = 64  # levels of nodes
 _HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
 
 
@@ -49,12 +47,12 @@ class GltfImporter(Importer):
                     remarks.append("Its scales are negative: logs, as a draft of the extension had them, are taken.")
             if not parts:
                 raise ValueError(f"no primitive of its scene has the extension {EXTENSION}")
-            back = _HALF_TURN if "splat-transform" in document.generator.lower() else _Z_UP
+            back = _HALF_TURN if "splat-transform" in document.generator.lower() else Z_UP
             return in_world("glTF of splats", parts, back, tuple(dict.fromkeys(remarks)))
 
 
 class _Document:
-    """The JSON of a glTF and its buffers; raises ``ValueError`` and its like for what is damaged."""
+    """The JSON of a glTF and its buffers; methods raise ``ValueError`` and similar errors for damaged files."""
 
     def __init__(self, content: dict[str, Any], binary: bytes, folder: Path) -> None:
         self._content, self._binary, self._folder = content, binary, folder
@@ -78,7 +76,7 @@ class _Document:
         return cls(json.loads(chunks[b"JSON"].decode("utf-8")), chunks.get(b"BIN\0", b""), path.parent)
 
     def placed(self) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-        """Yield the primitives of Gaussians of the scene, and the matrix [4, 4] from each to the scene."""
+        """Yield the scene's primitives of Gaussians, each with its matrix [4, 4] to the scene."""
         nodes, scenes = self._content.get("nodes", []), self._content.get("scenes", [])
         below = {child for node in nodes for child in node.get("children", [])}
         roots = [number for number in range(len(nodes)) if number not in below]
@@ -117,13 +115,13 @@ class _Document:
             bands += [values(f"SH_DEGREE_{degree}_COEF_{index}") for index in range(2 * degree + 1)]
         means, scales = values("POSITION"), values("SCALE")
         logs = bool((scales < 0).any())
-        log_scales = scales if logs else np.log(np.maximum(scales, _THINNEST))
+        log_scales = scales if logs else log_lengths(scales)
         rest = np.stack(bands, axis=1) if bands else np.zeros((len(means), 0, 3))
         quats, dc = values("ROTATION")[:, [3, 0, 1, 2]], values("SH_DEGREE_0_COEF_0")
         return gaussians_of(means, quats, log_scales, values("OPACITY")[:, 0], dc, rest), logs
 
     def _accessor(self, number: int) -> np.ndarray:
-        """Return [N, width] float64."""
+        """Return the values of an accessor, [N, width] float64."""
         accessor = self._content["accessors"][number]
         if "sparse" in accessor:
             raise ValueError("it has sparse accessors, which are not read")
@@ -133,17 +131,13 @@ class _Document:
         content = self._buffer(view["buffer"])
         start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         stride = view.get("byteStride", dtype.itemsize * width)
-        if (
-            count < 1
-            or start < 0
-            or stride < dtype.itemsize * width
-            or start + stride * (count - 1) + dtype.itemsize * width > len(content)
-        ):
+        size = dtype.itemsize * width
+        if count < 1 or start < 0 or stride < size or start + stride * (count - 1) + size > len(content):
             raise ValueError(f"accessor {number} does not fit into its buffer")
-        found = np.ndarray((count, width), dtype, content, start, (stride, dtype.itemsize)).astype(np.float64)
+        values = np.ndarray((count, width), dtype, content, start, (stride, dtype.itemsize)).astype(np.float64)
         if accessor.get("normalized"):
-            found = np.maximum(found / np.iinfo(dtype).max, -1.0)
-        return found
+            values = np.maximum(values / np.iinfo(dtype).max, -1.0)
+        return values
 
     def _buffer(self, number: int) -> bytes:
         uri = self._content["buffers"][number].get("uri")
@@ -158,7 +152,7 @@ class _Document:
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:
-    """Return the matrix [4, 4] of a node to the one above."""
+    """Return the matrix [4, 4] from a node to its parent."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     x, y, z, w = node.get("rotation", [0.0, 0.0, 0.0, 1.0])

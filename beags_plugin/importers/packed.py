@@ -1,4 +1,4 @@
-"""What readers of compressed splat files share."""
+"""Functions that the readers of compressed splat files share."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from beags_plugin.core.flattening import Gaussians
 from beags_plugin.core.sh import MAX_DEGREE, num_sh_bases
+from beags_plugin.importers.activation import THINNEST
 from beags_plugin.importers.base import ImportedScene
 from beags_plugin.splat_io.far_worlds import FAR
 from beags_plugin.splat_io.frames import turned_gaussians
@@ -28,40 +29,38 @@ _DAMAGED = (
     ValueError, LookupError, TypeError, AttributeError, OverflowError, EOFError, MemoryError, RuntimeError,
     struct.error, zlib.error, zipfile.BadZipFile, Image.DecompressionBombError,
 )  # fmt: skip
-"""What a file whose parts are not what they should be raises: JSON of other types, nested too deeply, encrypted."""
-_UNEVEN = 1e-3  # largest difference of a matrix's axes in length, and from right angles
-MOST_ZIPPED = 1032  # bytes that one byte of deflate can stand for
+"""Errors that damaged files raise, for example by JSON of other types, too deep nesting, or encryption."""
+_UNEVEN = 1e-3  # largest deviation of a matrix's axes from equal lengths and right angles
+MOST_ZIPPED = 1032  # largest expansion by deflate
+Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
+"""Rotation from y up to z up."""
 
 
 @contextmanager
 def reading(path: Path, kind: str) -> Iterator[None]:
-    """Turn what a missing or damaged file of a ``kind``, such as ".spz", makes the block raise into a ``UserError``."""
+    """Turn the errors of a missing or damaged file in the block into a ``UserError``; kind: such as ".spz"."""
     try:
         yield
     except (*_DAMAGED, OSError) as error:
-        if isinstance(error, OSError) and error.errno is not None:  # bare ones of libraries are of the content
+        if isinstance(error, OSError) and error.errno is not None:  # libraries raise others for bad content
             raise UserError(f"{path} cannot be read ({reason(error)}): name an existing {kind} file.") from error
         if (cause := stand_in(path)) is not None:
             raise UserError(f"{path} is no {kind} file ({cause}).") from error
-        if (cause := starts_as(path)) is not None and not _fits(path, cause):
+        # A file that starts as its suffix promises is damaged, not misnamed.
+        if (cause := starts_as(path)) is not None and path.suffix.lower() not in cause.partition(":")[0]:
             raise UserError(f"{path} is no {kind} file ({cause}).") from error
         raise UserError(f"{path} is no {kind} file, or damaged ({reason(error)}): get it again.") from error
 
 
-def _fits(path: Path, start: str) -> bool:
-    """Return whether a file of this name starts as such files do, so that it is damaged, not misnamed."""
-    return path.suffix.lower() in start.partition(":")[0]
-
-
-def tensor(values: np.ndarray) -> Tensor:
-    """Return an array as float32."""
-    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+def log_lengths(scales: np.ndarray) -> np.ndarray:
+    """Return the logs of scales that are lengths, of which some may be 0."""
+    return np.log(np.maximum(scales, THINNEST))
 
 
 def gaussians_of(
     means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, alphas: np.ndarray, dc: np.ndarray, rest: np.ndarray
 ) -> Gaussians:
-    """Return N Gaussians from arrays as in ``core.flattening.Gaussians``, but opacities 0..1; bands above 3 are cut.
+    """Return N Gaussians from the arrays of ``core.flattening.Gaussians``, with opacities 0..1; bands above 3 are cut.
 
     Raises ``ValueError`` for arrays of different lengths.
     """
@@ -69,11 +68,14 @@ def gaussians_of(
         raise ValueError("its Gaussians have not as many places as rotations, scales, opacities or colours")
     rest = rest[:, : num_sh_bases(MAX_DEGREE) - 1]
     logits = torch.logit(torch.from_numpy(np.ascontiguousarray(alphas, dtype=np.float64))).float()
-    return Gaussians(tensor(means), tensor(quats), tensor(log_scales), logits, tensor(dc), tensor(rest))
+    means, quats, log_scales, dc, rest = (
+        torch.from_numpy(np.ascontiguousarray(each, dtype=np.float32)) for each in (means, quats, log_scales, dc, rest)
+    )
+    return Gaussians(means, quats, log_scales, logits, dc, rest)
 
 
 def with_largest(three: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return unit quaternions [N, 4] from three components [N, 3] and the place [N] of the fourth, made positive."""
+    """Return unit quaternions [N, 4] from three components [N, 3] and the index [N] of the fourth, positive one."""
     fourth = np.sqrt(np.maximum(0.0, 1.0 - np.square(three).sum(axis=1)))
     quats = np.empty((len(three), 4))
     others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[place]
@@ -83,19 +85,19 @@ def with_largest(three: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 def sh_degree(coefficients: int) -> int:
-    """Return the degree of so many coefficients of the higher bands, a colour."""
+    """Return the SH degree of a number of coefficients of the higher bands, for each colour."""
     return round((1 + coefficients) ** 0.5) - 1
 
 
 def cut_bands(degree: int) -> tuple[str, ...]:
-    """Return a sentence where a file has bands above the highest degree that is held."""
+    """Return a sentence for a file with bands above ``MAX_DEGREE``; none for others."""
     if degree <= MAX_DEGREE:
         return ()
     return (f"Its colours have bands up to degree {degree}, of which those above {MAX_DEGREE} are left out.",)
 
 
 def joined(parts: Sequence[Gaussians]) -> Gaussians:
-    """Return the Gaussians of all parts, one after the other; bands that a part lacks are 0."""
+    """Concatenate parts; bands that a part lacks are 0."""
     width = max(part.sh_rest.shape[1] for part in parts)
 
     def values(part: Gaussians, name: str) -> Tensor:
@@ -108,9 +110,9 @@ def joined(parts: Sequence[Gaussians]) -> Gaussians:
 
 
 def moved_by(gaussians: Gaussians, matrix: np.ndarray) -> tuple[Gaussians, Tensor]:
-    """Return Gaussians moved by a matrix [4, 4], which turns, shifts and scales alike; else raises ``ValueError``.
+    """Return Gaussians moved by a matrix [4, 4], and their means [N, 3] in float64.
 
-    The second part are their means [N, 3] in float64.
+    Raises ``ValueError`` unless the matrix is a rotation, a shift and a uniform scale.
     """
     linear = matrix[:3, :3]
     factor = float(np.cbrt(np.linalg.det(linear)))
@@ -125,7 +127,7 @@ def moved_by(gaussians: Gaussians, matrix: np.ndarray) -> tuple[Gaussians, Tenso
 def in_world(
     kind: str, parts: Sequence[tuple[Gaussians, Tensor]], turn: Tensor | None, remarks: tuple[str, ...]
 ) -> ImportedScene:
-    """Return the scene of all parts as ``moved_by`` returns them, turned by ``turn`` [3, 3] float64."""
+    """Return the scene of all parts, results of ``moved_by``, turned by ``turn`` [3, 3] float64."""
     gaussians, means = joined([part for part, _ in parts]), torch.cat([exact for _, exact in parts])
     if turn is not None:
         gaussians, means = turned_gaussians(gaussians, turn), means @ turn.T
@@ -133,7 +135,7 @@ def in_world(
 
 
 def _far(means: Tensor) -> Tensor | None:
-    """Return means [N, 3] float64 that lie far from 0 for their extent; None for others."""
+    """Return means [N, 3] float64 if they lie far from 0 relative to their extent; else None."""
     known = means[means.isfinite().all(dim=1)]
     if not len(known):
         return None

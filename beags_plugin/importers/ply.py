@@ -1,4 +1,4 @@
-"""Splat .ply files: of 3DGS and of 2DGS, of ns-export, and our own."""
+"""Importer of splat .ply files of 3DGS, 2DGS, ns-export and beags."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from beags_plugin.splat_io.splat_file import read_splat_file
 
 def newest_of_run(path: Path) -> Path | None:
     """Return the .ply of the last iteration in the folder of a run of 3DGS or 2DGS; None for another path."""
-    found = [file for file in path.glob("point_cloud/iteration_*/point_cloud.ply") if _iteration(file).isdigit()]
-    return max(found, key=lambda file: int(_iteration(file)), default=None)
+    files = [file for file in path.glob("point_cloud/iteration_*/point_cloud.ply") if _iteration(file).isdigit()]
+    return max(files, key=lambda file: int(_iteration(file)), default=None)
 
 
 def _iteration(file: Path) -> str:
@@ -21,7 +21,7 @@ def _iteration(file: Path) -> str:
 
 
 class PlyImporter(Importer):
-    """The official layouts, in the world of the input poses, where the official programs and ``beags export`` write."""
+    """The official layouts, in the world of the input poses, as other programs and ``beags export`` write them."""
 
     marks: ClassVar[str] = "a splat .ply, or the folder of a run of 3DGS or 2DGS"
 

@@ -1,6 +1,6 @@
-"""PlayCanvas' .sog, version 2, read as its specification says (developer.playcanvas.com, "The SOG Format").
+"""Importer of PlayCanvas' .sog, version 2 (developer.playcanvas.com, "The SOG Format").
 
-A zip of WebP images with one pixel for each Gaussian, and meta.json; or the same files unzipped beside meta.json.
+The format is a zip of meta.json and WebP images with one pixel for each Gaussian, or the same files unzipped.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from beags_plugin.importers.base import ImportedScene, Importer
 from beags_plugin.importers.packed import cut_bands, gaussians_of, reading, with_largest
 
 _META = "meta.json"
-_ROW = 64  # palette entries in a row of their image
-_LARGEST_META = 1 << 24  # bytes
-_UNPACKED, _SMALL = 4, 1 << 16  # bytes that one of a packed image may become, and what any may
-_PACKED = 64  # Gaussians whose places a byte may hold: more than hold any but those all of one place
-_PALETTE = 1 << 24  # pixels of the image of 65,536 entries with 24 coefficients, and as many again
-_TAG = 252  # plus the place of the component that a rotation leaves out
+_ROW = 64  # palette entries in a row of the palette image
+_LARGEST_META = 1 << 24  # bytes of meta.json
+_UNPACKED, _SMALL = 4, 1 << 16  # largest expansion of an image in the zip, and bytes that are always allowed
+_PACKED = 64  # largest number of Gaussians per byte of positions, unless all have one position
+_PALETTE = 1 << 24  # largest palette image, pixels
+_TAG = 252  # value of a rotation's alpha, plus the index of the component that is left out
 
 
 class SogImporter(Importer):
-    """In the world of the input poses, as .ply files."""
+    """A .sog or its unzipped folder, in the world of the input poses like .ply files."""
 
     marks: ClassVar[str] = "a .sog"
 
@@ -48,9 +48,9 @@ class SogImporter(Importer):
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> bytes:
-    """Return a file of an archive; raises ``ValueError`` for one that unpacks to far more than such files hold.
+    """Return a file of an archive; raises ``ValueError`` for one that unpacks to far more than real files.
 
-    The bound is checked as bytes come, whatever the archive says: images are packed already, and meta.json is short.
+    The bound holds for the unpacked bytes, not for the size that the archive states.
     """
     most = _LARGEST_META if name == _META else _UNPACKED * archive.getinfo(name).compress_size + _SMALL
     with archive.open(name) as file:
@@ -61,27 +61,27 @@ def _member(archive: zipfile.ZipFile, name: str) -> bytes:
 
 
 def _inside(name: str) -> str:
-    """Return the name of a file beside another; raises ``ValueError`` where it leads out of the folder."""
+    """Return a file's name; raises ``ValueError`` if it leads out of the folder."""
     if Path(name).name != name:
         raise ValueError(f"it names the file {name!r}")
     return name
 
 
 def _scene(content: Callable[[str], bytes]) -> ImportedScene:
-    """Return the scene of the files that ``content`` returns."""
+    """Return the scene; content: returns the bytes of a file by its name."""
     meta = json.loads(content(_META))
     if meta.get("version") != 2:
         raise ValueError(f"its version is {meta.get('version')}, but 2 is read")
     count = int(meta["count"])
-    lowest = content(meta["means"]["files"][0])  # the lower bytes of places, which hardly pack
+    lowest = content(meta["means"]["files"][0])  # the lower bytes of positions hardly compress
     if not 0 <= count <= _PACKED * len(lowest) + _SMALL:
         raise ValueError(f"it promises {count} Gaussians, which do not fit into it")
 
     def pixels(block: str, file: int = 0) -> np.ndarray:
-        found = _image(content(meta[block]["files"][file]), 4 * count + _SMALL).reshape(-1, 4)[:count]
-        if len(found) < count:
-            raise ValueError(f"an image of its {block} has {len(found)} of {count} pixels")
-        return found
+        values = _image(content(meta[block]["files"][file]), 4 * count + _SMALL).reshape(-1, 4)[:count]
+        if len(values) < count:
+            raise ValueError(f"an image of its {block} has {len(values)} of {count} pixels")
+        return values
 
     low, high = (np.array(meta["means"][end], np.float64) for end in ("mins", "maxs"))
     logs = low + (256 * pixels("means", 1)[:, :3] + pixels("means")[:, :3]) / 65535 * (high - low)
@@ -110,7 +110,7 @@ def _scene(content: Callable[[str], bytes]) -> ImportedScene:
 
 
 def _image(data: bytes, most: int) -> np.ndarray:
-    """Return [H, W, 4] int64; raises ``ValueError`` for an image of more than ``most`` pixels."""
+    """Return an image [H, W, 4] int64; raises ``ValueError`` if it has more than ``most`` pixels."""
     from PIL import Image
 
     with Image.open(io.BytesIO(data), formats=["WEBP", "PNG"]) as image:
@@ -124,7 +124,7 @@ def _values(meta: dict[str, Any], block: str) -> np.ndarray:
 
 
 def _bands(meta: dict[str, Any], palette: np.ndarray, labels: np.ndarray, coefficients: int) -> np.ndarray:
-    """Return [N, coefficients, 3] of the entries that ``labels`` [N, 4] name in the image of the palette."""
+    """Return the coefficients [N, coefficients, 3] of the palette entries that ``labels`` [N, 4] name."""
     entries = labels[:, 0] + 256 * labels[:, 1]
     if len(entries) and entries.max() >= int(meta["shN"]["count"]):
         raise ValueError("a Gaussian names an entry that its palette lacks")

@@ -1,7 +1,7 @@
-""".splat files of antimatter15's viewer: 32 bytes a Gaussian, as its description says.
+"""Importer of .splat files of antimatter15's viewer, with 32 bytes for each Gaussian.
 
-Three floats of its place, three of its scales (lengths), red, green, blue and opacity as bytes, and a quaternion wxyz
-as bytes, (b - 128) / 128.
+These are three floats of position, three of scales (lengths), red, green, blue and opacity as bytes, and a quaternion
+wxyz as bytes, (b - 128) / 128.
 """
 
 from __future__ import annotations
@@ -13,15 +13,14 @@ import numpy as np
 
 from beags_plugin.core.densification import SH_C0
 from beags_plugin.importers.base import ImportedScene, Importer
-from beags_plugin.importers.packed import gaussians_of, reading
+from beags_plugin.importers.packed import gaussians_of, log_lengths, reading
 from beags_plugin.system.reading.stand_ins import stand_in, starts_as
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
-_THINNEST = 1e-12  # units of length: of scales that are 0
 
 
 class SplatImporter(Importer):
-    """In the world of the input poses; its Gaussians have one colour from all sides."""
+    """A .splat, in the world of the input poses; its Gaussians have one colour from all sides."""
 
     marks: ClassVar[str] = "a .splat"
 
@@ -31,7 +30,7 @@ class SplatImporter(Importer):
     def read(self, path: Path) -> ImportedScene:
         with reading(path, ".splat"):
             content = path.read_bytes()
-            if (cause := stand_in(path) or starts_as(path)) is not None:  # nothing marks the format itself
+            if (cause := stand_in(path) or starts_as(path)) is not None:  # the format has no mark of its own
                 raise ValueError(cause)
             if len(content) % _ROW.itemsize:
                 raise ValueError(f"it has {len(content)} bytes, which are no whole rows of {_ROW.itemsize}")
@@ -40,7 +39,7 @@ class SplatImporter(Importer):
             gaussians = gaussians_of(
                 rows["mean"],
                 (rows["quat"].astype(np.float64) - 128.0) / 128.0,
-                np.log(np.maximum(rows["scale"], _THINNEST)),
+                log_lengths(rows["scale"]),
                 color[:, 3],
                 (color[:, :3] - 0.5) / SH_C0,
                 np.zeros((len(rows), 0, 3)),

@@ -1,9 +1,9 @@
-"""Niantic's .spz, versions 2 to 4, read as the format's public description says (nianticlabs/spz, README).
+"""Importer of Niantic's .spz, versions 2 to 4 (README of nianticlabs/spz).
 
 Versions 2 and 3 are one gzip stream: a header of 16 bytes, then positions (24-bit fixed point), alphas, colours,
-scales, rotations and bands, each for all Gaussians. Version 4 has a bare header of 32 bytes and a zstd stream for each
-of the six. Rotations: 8 bits of x, y and z in version 2; since 3, the place of the largest component in the two highest
-of 32 bits, and of the other three a sign and 9 bits each, the last in the lowest.
+scales, rotations and bands, each for all Gaussians. Version 4 has an uncompressed header of 32 bytes and a zstd stream
+for each of the six. Rotations have 8 bits for each of x, y and z in version 2. Since version 3 the two highest of 32
+bits are the index of the largest component; the other three have a sign and 9 bits each, the last one lowest.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from beags_plugin.system.zstd import zstandard
 
 _MAGIC = 0x5053474E
 _COLOR_SCALE = 0.15
-_MOST_ZSTD = 40_000  # bytes that one byte of zstd can stand for, with a margin
-_HEADER = 32  # bytes of version 4's
+_MOST_ZSTD = 40_000  # largest expansion by zstd, with a margin
+_HEADER = 32  # bytes of the header of version 4
 _STREAMS = 6
-_AXES, _RIGHT_UP_BACK = 0xADBE0003, 4  # the extension of a coordinate system, and the format's own in its list
+_AXES, _RIGHT_UP_BACK = 0xADBE0003, 4  # extension for the axes, and the value of the format's own axes
 _HIGHEST_DEGREE = 4
-# The sign of each basis function when y and z are turned over: those of its factors y and z. Bands 1 to 3.
+# Signs by which the basis functions of bands 1 to 3 change when y and z change sign.
 HALF_TURN_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
 
 
 class SpzImporter(Importer):
-    """Turned back half a turn about x, to the axes of .ply files, from which the tools that make .spz turn them."""
+    """An .spz, turned back to the axes of .ply files: the tools that write .spz turn scenes half a turn about x."""
 
     marks: ClassVar[str] = "an .spz"
 
@@ -92,7 +92,7 @@ def _unzipped(content: bytes) -> tuple[int, int, int, int, list[np.ndarray]]:
 
 
 def _streams(content: bytes) -> tuple[int, int, int, int, list[np.ndarray]]:
-    """Return the same of version 4."""
+    """Return the same as ``_unzipped`` for version 4."""
     magic, version, count, degree, bits, _, streams, place = struct.unpack_from("<IIIBBBBI", content)
     if magic != _MAGIC or version != 4:
         raise ValueError("it starts with another format's bytes")
@@ -115,9 +115,9 @@ def _streams(content: bytes) -> tuple[int, int, int, int, list[np.ndarray]]:
 
 
 def _check_axes(records: bytes) -> None:
-    """Raise ``ValueError`` if an extension of version 4 says that the axes are not right, up and backward.
+    """Raise ``ValueError`` if an extension of version 4 states other axes than right, up and backward.
 
-    Records: 32 bits of the kind, 32 of the length, and the content; others tell of cameras, and are left out.
+    records: each has 32 bits of kind, 32 of length, and the content; those of other kinds are skipped.
     """
     at = 0
     while at + 8 <= len(records):
@@ -129,7 +129,7 @@ def _check_axes(records: bytes) -> None:
 
 def _unpacked(unpack: Any, packed: bytes, size: int) -> bytes:
     try:
-        part = unpack.stream_reader(packed).read(size + 1)  # the frame may promise more than there is room for
+        part = unpack.stream_reader(packed).read(size + 1)  # the frame may state a larger size
     except zstandard().ZstdError as error:
         raise ValueError(str(error)) from None
     if len(part) != size:
@@ -145,7 +145,7 @@ def _fixed_points(data: np.ndarray, bits: int) -> np.ndarray:
 
 
 def _three_bytes(data: np.ndarray) -> np.ndarray:
-    """Return quaternions wxyz of version 2: x, y, z as bytes, and w positive."""
+    """Return the quaternions wxyz of version 2: x, y, z as bytes, and w positive."""
     three = data.reshape(-1, 3) / 127.5 - 1.0
     return with_largest(three, np.zeros(len(three), np.int64))
 

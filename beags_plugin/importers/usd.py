@@ -1,6 +1,6 @@
-"""USD with the particle fields of OpenUSD 26.03: 3D Gaussians, or surflets, which are discs.
+"""Importer of USD with the particle fields of OpenUSD 26.03: 3D Gaussians, or surflets, which are discs.
 
-All fields of the stage are taken, each where its transforms put it, and the scene is turned so that z is up.
+All fields of the stage are read and moved by their transforms, and the scene is turned to z up.
 """
 
 from __future__ import annotations
@@ -11,19 +11,16 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import torch
 
 from beags_plugin.core.flattening import Gaussians
 from beags_plugin.core.sh import num_sh_bases
 from beags_plugin.importers.base import ImportedScene, Importer
-from beags_plugin.importers.packed import cut_bands, gaussians_of, in_world, moved_by, reading
+from beags_plugin.importers.packed import Z_UP, cut_bands, gaussians_of, in_world, log_lengths, moved_by, reading
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.stand_ins import stand_in
 
 _SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 _SURFLET = "ParticleFieldKernelGaussianSurfletAPI"
-_THINNEST = 1e-12  # units of length: of scales that are 0
-_Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
 
 
 class UsdImporter(Importer):
@@ -46,20 +43,20 @@ class UsdImporter(Importer):
                 stage = Usd.Stage.Open(str(path))
             except Tf.ErrorException as error:
                 raise ValueError(str(error).splitlines()[0]) from None
-            found, highest, flat = [], 0, set()
+            parts, highest, flat = [], 0, set()
             for prim in stage.Traverse():
                 if prim.GetTypeName() not in ("ParticleField", "ParticleField3DGaussianSplat"):
                     continue
                 gaussians, degree = _gaussians(prim)
                 matrix = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())).T
-                found.append(moved_by(gaussians, matrix))
+                parts.append(moved_by(gaussians, matrix))
                 flat.add(_SURFLET in prim.GetAppliedSchemas())
                 highest = max(highest, degree)
-            if not found:
+            if not parts:
                 raise ValueError("it has no particle field with places: OpenUSD 26.03 and later write them")
             kind = "USD of surflets" if flat == {True} else "USD of splats"
-            turn = _Z_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else None
-            scene = in_world(kind, found, turn, cut_bands(highest))
+            turn = Z_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else None
+            scene = in_world(kind, parts, turn, cut_bands(highest))
         if flat != {True}:
             return scene
         return replace(
@@ -71,7 +68,7 @@ def _gaussians(prim: Any) -> tuple[Gaussians, int]:
     """Return the Gaussians of a field in its own frame, and the degree of its bands."""
 
     def values(name: str, width: int) -> np.ndarray | None:
-        for each in (name, f"{name}h"):  # the second holds half floats
+        for each in (name, f"{name}h"):  # the name with h holds half floats
             attribute = prim.GetAttribute(each)
             if attribute and (content := attribute.Get()) is not None and len(content):
                 return np.array(content, np.float64).reshape(-1, width)
@@ -84,7 +81,7 @@ def _gaussians(prim: Any) -> tuple[Gaussians, int]:
 
     def of_each(name: str, width: int, rows: int, default: list[float]) -> np.ndarray:
         found = values(name, width)
-        if found is None or len(found) < rows:  # the schemas say so
+        if found is None or len(found) < rows:  # the schemas define this default
             return np.tile(np.array(default), (rows, 1))
         return found[:rows]
 
@@ -100,5 +97,5 @@ def _gaussians(prim: Any) -> tuple[Gaussians, int]:
     if _SURFLET in prim.GetAppliedSchemas():
         scales = scales.copy()
         scales[:, 2] = 0.0
-    log_scales = np.log(np.maximum(scales, _THINNEST))
+    log_scales = log_lengths(scales)
     return gaussians_of(means, quats[:, [3, 0, 1, 2]], log_scales, alphas, sh[:, 0], sh[:, 1:]), degree

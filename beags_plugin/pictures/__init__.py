@@ -1,1 +1,1 @@
-"""Pictures for people: contact sheets, objects alone, films, masks."""
+"""Pictures for users: contact sheets, objects alone, films, masks."""

@@ -1,25 +1,29 @@
-"""Pictures made of captioned cells: cropping around an object, resizing, joining."""
+"""Cells with captions, from which pictures are made: cropping around an object, resizing, joining."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from beags_plugin.system.errors import UserError, writing
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 CAPTION = 18  # pixels of text above each cell
 FURTHER_LINE = 12  # pixels of each line of text after the first
 GAP = 4  # pixels between cells
-MARGIN = 0.15  # of the crop, around the object: its boundary may spread
+MARGIN = 0.15  # margin of a crop around the object, whose boundary may spread
 
 Square = tuple[int, int, int]
-"""(top, left, side) in pixels; it may leave the image."""
+"""(top, left, side) in pixels; it may extend beyond the image."""
 
 
 def square_around(shown: np.ndarray) -> Square:
-    """Return the square that holds the True pixels of ``shown`` [H, W] bool and a margin; the whole image for none."""
+    """Return the square around the True pixels of ``shown`` [H, W] bool with a margin; the whole image if there are none."""
     height, width = shown.shape
     if not shown.any():
         return 0, 0, max(height, width)
@@ -30,7 +34,7 @@ def square_around(shown: np.ndarray) -> Square:
 
 
 def crop(image: np.ndarray, square: Square, fill: int = 0) -> np.ndarray:
-    """Return [side, side, C]: the part of an image [H, W, C] in the square; ``fill`` outside the image."""
+    """Return the part of an image [H, W, C] in the square, [side, side, C]; ``fill`` outside the image."""
     top, left, side = square
     part = np.full((side, side, *image.shape[2:]), fill, dtype=image.dtype)
     y0, x0 = max(top, 0), max(left, 0)
@@ -41,9 +45,9 @@ def crop(image: np.ndarray, square: Square, fill: int = 0) -> np.ndarray:
 
 
 def cell(image: np.ndarray, size: tuple[int, int], caption: str) -> np.ndarray:
-    """Return [height + CAPTION, width, 3] uint8: the image resized to (width, height) under its caption.
+    """Return [height + CAPTION, width, 3] uint8: the image resized to (width, height) below its caption.
 
-    A caption of several lines takes ``FURTHER_LINE`` more for each.
+    Each line of the caption after the first adds ``FURTHER_LINE``.
     """
     from PIL import Image, ImageDraw
 
@@ -59,6 +63,11 @@ def cell(image: np.ndarray, size: tuple[int, int], caption: str) -> np.ndarray:
     return np.asarray(picture)
 
 
+def as_bytes(image: Tensor) -> np.ndarray:
+    """Return a float image in 0..1 as uint8; values outside are clamped."""
+    return (image.detach().clamp(0, 1).cpu() * 255).round().byte().numpy()
+
+
 def checkerboard(height: int, width: int, side: int) -> np.ndarray:
     """Return [height, width] int64: squares of two greys, ``side`` pixels wide."""
     y, x = np.mgrid[:height, :width] // side
@@ -71,7 +80,7 @@ def printable(text: str) -> str:
 
 
 def beside(cells: Iterable[np.ndarray]) -> np.ndarray:
-    """Join cells of any height in a line, with a gap after each."""
+    """Join cells of any height side by side, with a gap after each."""
     cells = list(cells)
     tallest = max(len(c) for c in cells)
     padded = [np.pad(c, ((0, tallest - len(c)), (0, GAP), (0, 0)), constant_values=255) for c in cells]
@@ -86,7 +95,7 @@ def below(lines: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def wrapped(groups: Iterable[Sequence[np.ndarray]], width: int) -> list[np.ndarray]:
-    """Return lines at most ``width`` pixels wide, unless one group alone is wider; a group of cells stays together."""
+    """Return lines at most ``width`` pixels wide, unless one group is wider; the cells of a group stay together."""
     lines: list[list[np.ndarray]] = []
     used = 0
     for group in groups:

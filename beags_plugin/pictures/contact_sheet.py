@@ -13,12 +13,12 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.records import EvalView
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
-from beags_plugin.labels.colors import colorize
-from beags_plugin.pictures.cells import GAP, below, cell, wrapped
-from beags_plugin.pictures.object_cells import COLUMNS, Drawing, as_bytes, cell_size, object_shots
+from beags_plugin.pictures.cells import GAP, as_bytes, below, cell, wrapped
+from beags_plugin.pictures.masks import overlay
+from beags_plugin.pictures.object_cells import COLUMNS, Drawing, cell_size, object_shots
 from beags_plugin.rasterizers.rendering import surfel_inputs
 
-_WIDTH = 1920  # pixels of a sheet, if no object needs more; what does not fit goes on below
+_WIDTH = 1920  # pixels of a sheet, if no object needs more; further cells go below
 
 
 def contact_sheet(
@@ -34,14 +34,14 @@ def contact_sheet(
 ) -> np.ndarray:
     """Return [H, W, 3] uint8: photo, mask and render of some views, then the cells of each object (``object_shots``).
 
-    views: held-out ones. cameras: of the training photos. scene: all Gaussians. objects: id to stage (such as before)
-    to its Gaussians alone; those without any are left out. classes: id to name. background: [3], behind the scene;
-    black if None. progress: receives (done, total) parts. Raises ``ValueError`` if there is nothing to show.
+    views: held-out views. cameras: cameras of the training photos. scene: all Gaussians. objects: id to stage (such as
+    "before") to the object's Gaussians; objects without any are left out. classes: id to name. background: [3], behind
+    the scene; black if None. progress: receives (done, total) parts. Raises ``ValueError`` if there is nothing to show.
     """
     views = list(views)
     objects = {each: stages for each, stages in sorted(objects.items()) if any(len(s) for s in stages.values())}
     masked = any(view.visible is not None for view in views)
-    count = COLUMNS // (3 if masked else 2)  # groups of photo, mask and render, or without a mask, fill a line
+    count = COLUMNS // (3 if masked else 2)  # groups of photo, mask (if any) and render that fill a line
     chosen = views[:: max(1, len(views) // count)][:count]
     if not (chosen or objects):
         raise ValueError("a contact sheet needs a view or an object")
@@ -69,7 +69,7 @@ def contact_sheet(
 def _scene_cells(
     view: EvalView, scene: Surfels, drawing: Drawing, background: Tensor | None, width: int
 ) -> list[np.ndarray]:
-    """Return the cells of one view of the scene: photo and mask, if it has them, and render."""
+    """Return the cells of one view of the scene: photo and mask, if there are any, and render."""
     settings = replace(drawing.settings, geometry=False, distortion=False)
     with torch.no_grad():
         behind = scene.means.new_zeros(3) if background is None else background
@@ -84,19 +84,6 @@ def _scene_cells(
         pictures.append((photo, view.name))
         if view.visible is not None:
             labels = resize_nearest(view.visible.cpu().numpy(), high, wide)
-            pictures.append((mask_overlay(photo, labels), "mask"))
+            pictures.append((overlay(photo, np.where(labels == IGNORE, 0, labels)), "mask"))
     pictures.append((render, "render" if pictures else f"{view.name}: render"))
     return [cell(picture, size, caption) for picture, caption in pictures]
-
-
-def mask_overlay(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Return [H, W, 3] uint8: the photo in half its strength under the colours; background and IGNORE stay as they are.
-
-    photo: [h, w, 3] uint8. labels: [H, W] integer class ids.
-    """
-    colors = colorize(labels)
-    if photo.shape[:2] != labels.shape:
-        photo = np.stack([resize_nearest(photo[..., i], *labels.shape) for i in range(3)], axis=-1)
-    mixed = (photo.astype(np.uint16) + colors) // 2
-    shown = (labels != 0) & (labels != IGNORE)
-    return np.where(shown[..., None], mixed, photo).astype(np.uint8)

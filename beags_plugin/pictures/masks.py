@@ -1,4 +1,4 @@
-"""Pictures of masks: before and after reprojection, contradictions between views, and the coverage of each view."""
+"""Pictures of masks: before and after reprojection, contradictions between views, coverage of each view."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from beags_plugin.pictures.cells import GAP, below, beside, cell, wrapped, write
 from beags_plugin.system.errors import writing
 from beags_plugin.system.reading.images import read_image
 
-_WIDTH = 300  # pixels of a cell
+_WIDTH = 300  # pixels of the width of a cell
 CHANGED = (255, 0, 255)
 MARK = (255, 255, 0)
 
 
 @dataclass(frozen=True)
 class Changed:
-    """One view before and after: photo [H, W, 3] uint8; given (or None) and voted [H, W] ids; confidence uint8."""
+    """One view: photo [H, W, 3] uint8; ids given (or None) and voted, [H, W]; confidence [H, W] uint8."""
 
     name: str
     photo: np.ndarray
@@ -32,7 +32,7 @@ class Changed:
 
 @dataclass(frozen=True)
 class Pointed:
-    """One view with N contradicted points: photo; given [H, W] ids; places [N, 2] in 0..1; others: ids [N]."""
+    """One view with N contradicted points: given [H, W] ids; places [N, 2] in 0..1; others: ids [N] in other views."""
 
     name: str
     photo: Path
@@ -42,7 +42,7 @@ class Pointed:
 
 
 def overlay(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Return [H, W, 3] uint8: the photo with its objects tinted (IGNORE grey), the background as it is."""
+    """Return a photo [H, W, 3] uint8 with its objects tinted (IGNORE grey) and its background unchanged."""
     tint = colorize(labels).astype(np.float32)
     return np.where((labels != 0)[..., None], 0.5 * photo + 0.5 * tint, photo).astype(np.uint8)
 
@@ -50,12 +50,10 @@ def overlay(photo: np.ndarray, labels: np.ndarray) -> np.ndarray:
 def before_and_after(path: Path, views: Sequence[Changed], legend: str | None = None) -> None:
     """Write a picture with a line per view: mask before, mask after, changes, confidence.
 
-    legend: says what the grey values are, if not the share of the winning votes.
+    legend: meaning of the grey values, if they are not the share of the winning votes.
     """
     lines = []
     for view in views:
-        height, width = view.voted.shape
-        size = (_WIDTH, max(1, round(_WIDTH * height / width)))
         marked = view.photo.copy()
         text = "no mask before"
         if view.given is not None:
@@ -70,7 +68,7 @@ def before_and_after(path: Path, views: Sequence[Changed], legend: str | None = 
             (marked, text),
             (grey, legend or f"share of the winning votes, mean {view.confidence.mean() / 255:.3f}"),
         ]
-        lines.append(beside([cell(image, size, caption) for image, caption in cells]))
+        lines.append(beside([cell(image, _size(view.voted), caption) for image, caption in cells]))
     write_picture(path, below(lines))
 
 
@@ -79,8 +77,8 @@ def contradicted_picture(
 ) -> None:
     """Write a picture of views that the others contradict.
 
-    pointed: masks with dots at contradicted points, in the colours of the classes that the others say (background:
-    black). framed: masks beside the labels of the other views, with the contradicted boxes.
+    pointed: views drawn with dots at contradicted points, in the colours of the classes in other views (background:
+    black). framed: views and their contradicted boxes; each mask is drawn beside the labels of the other views.
     """
     dotted, compared = [], []
     for view in pointed:
@@ -88,18 +86,21 @@ def contradicted_picture(
         height, width = view.given.shape
         for place, color in zip(view.places, colorize(view.others), strict=True):
             _dot(shown, place * [width, height], color)
-        size = (2 * _WIDTH, max(1, round(2 * _WIDTH * height / width)))
-        dotted.append([cell(shown, size, f"{view.name}: {len(view.places)} points in the colours of the other views")])
+        caption = f"{view.name}: {len(view.places)} points in the colours of the other views"
+        dotted.append([cell(shown, _size(view.given, 2 * _WIDTH), caption)])
     for view, boxes in framed:
-        height, width = view.voted.shape
-        size = (_WIDTH, max(1, round(_WIDTH * height / width)))
         masks = [view.photo if view.given is None else overlay(view.photo, view.given), overlay(view.photo, view.voted)]
         for mask in masks:
             for box in boxes:
                 _frame(mask, box)
         captions = (f"{view.name}: as given", "the other views")
-        compared.append([cell(mask, size, text) for mask, text in zip(masks, captions, strict=True)])
+        compared.append([cell(mask, _size(view.voted), text) for mask, text in zip(masks, captions, strict=True)])
     write_picture(path, below([line for cells in (dotted, compared) for line in wrapped(cells, 4 * (_WIDTH + GAP))]))
+
+
+def _size(labels: np.ndarray, width: int = _WIDTH) -> tuple[int, int]:
+    """Return width and height of a cell for a view with labels [H, W]."""
+    return width, max(1, round(width * labels.shape[0] / labels.shape[1]))
 
 
 def _dot(image: np.ndarray, place: np.ndarray, color: np.ndarray) -> None:
@@ -128,7 +129,7 @@ def coverage_picture(
 ) -> None:
     """Write a picture of the share of each view that each object covers.
 
-    share: [V, C] of the view's pixels for each of ``ids``. usable: [V] bool; views without a mask are hatched.
+    share: [V, C], share of the view's pixels for each of ``ids``. usable: [V] bool; views without a mask are hatched.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import LogNorm

@@ -1,4 +1,4 @@
-"""One object of a run alone, before and after refinement: as held-out photos show it, and where they do not look."""
+"""Cells of one object of a run alone, before and after refinement, in held-out views and from hidden sides."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.records import EvalView
 from beags_plugin.evaluation.truths import extracted_truth
 from beags_plugin.labels.class_ids import resize_nearest
-from beags_plugin.pictures.cells import GAP, Square, below, cell, checkerboard, square_around, wrapped
+from beags_plugin.pictures.cells import GAP, Square, as_bytes, below, cell, checkerboard, square_around, wrapped
 from beags_plugin.pictures.orbit import OrbitFrame, least_shown, orbit_frame, orbit_settings, shows, side, view_from
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.surfaces.frames import bounding_box
 
-COLUMNS = 6  # cells of a line
-SMALLEST, LARGEST = 150, 480  # pixels: sides of a cell, where the objects have fewer or more in the photos
-FAINT = 0.1  # alpha from which a stray splat widens the crop
-_VIEWS = 2  # each with its photo, before and after: they fill a line
-_PROBE, _ROOM = 160, 3.0  # pixels, and sides of the object's box, in which stray splats are looked for
+COLUMNS = 6  # cells in a line
+SMALLEST, LARGEST = 150, 480  # bounds for the side of a cell, pixels
+FAINT = 0.1  # alpha from which a stray Gaussian widens the crop
+_VIEWS = 2  # views in a line, each with photo, before and after
+_PROBE, _ROOM = 160, 3.0  # pixels, and sides of the object's box, of the search for stray Gaussians
 _BELOW, _LEVEL = -30.0, 10.0  # degrees above the horizon
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """What renders a sheet; settings: of the scene, for colours only."""
+    """Rasterizer of a sheet; settings: the scene's, for colours only."""
 
     rasterizer: Rasterizer
     settings: RasterSettings
@@ -39,8 +39,8 @@ class Drawing:
 
 @dataclass(frozen=True)
 class _Shot:
-    """A square picture of an object. camera: of as many pixels as the photo's file has there. photo: [h, w, 3] uint8,
-    or None where no photo looks."""
+    """A square picture of an object. camera: at the resolution of the photo's file. photo: [h, w, 3] uint8, or None
+    without a photo from there."""
 
     caption: str
     camera: Camera
@@ -50,8 +50,8 @@ class _Shot:
 
 @dataclass(frozen=True)
 class ObjectShots:
-    """The pictures to take of an object. stages: caption to its Gaussians alone. pixels: side of the renders, as many
-    as the photos' files have there, at most ``LARGEST``."""
+    """The pictures to render of an object. stages: caption to its Gaussians alone. pixels: side of the renders, at the
+    resolution of the photos' files, at most ``LARGEST``."""
 
     name: str
     stages: Mapping[str, Surfels]
@@ -59,7 +59,7 @@ class ObjectShots:
     pixels: int
 
     def cells(self, size: int, drawing: Drawing) -> np.ndarray:
-        """Return [H, W, 3] uint8: lines of ``COLUMNS`` cells, ``size`` pixels wide."""
+        """Return [H, W, 3] uint8: lines of ``COLUMNS`` cells that are ``size`` pixels wide."""
         pixels, groups = min(self.pixels, size), []
         for shot in self.shots:
             photo = [] if shot.photo is None else [cell(shot.photo, (size, size), f"{self.name}, {shot.caption}")]
@@ -73,7 +73,7 @@ class ObjectShots:
 
 
 def cell_size(objects: Sequence[ObjectShots]) -> int:
-    """Return the side of the cells of a sheet, one for all, so that its lines end together: what the middle one has."""
+    """Return one side for all cells of a sheet, so that its lines end together: the median of the objects' sides."""
     return max(round(float(np.median([each.pixels for each in objects]))), SMALLEST) if objects else LARGEST
 
 
@@ -85,14 +85,14 @@ def object_shots(
     cameras: Sequence[Camera],
     drawing: Drawing,
 ) -> ObjectShots:
-    """Return the pictures to take of an object, at the resolution that the photos' files have of it.
+    """Return the pictures to render of an object, at the resolution of the photos' files.
 
-    The first line has two held-out photos from sides far apart, and the object there at each stage; the second two
-    sides from below the horizon, and the one that photos show least. Crops hold all of the object that is drawn, strays
-    too.
+    The first line has two held-out photos from sides far apart, each with the object at every stage. The second has two
+    sides from below the horizon and the side that photos show least. Crops hold everything that is rendered, also
+    strays.
 
-    stages: caption to the object's Gaussians alone; the last one that has any says where it is. views: held-out ones;
-    those that do not show the object are left out. cameras: of the training photos.
+    stages: caption to the object's Gaussians alone; the last one with any defines its place. views: held-out views;
+    those that do not show the object are left out. cameras: cameras of the training photos.
     """
     place = next(each for each in reversed(list(stages.values())) if len(each))
     stand = orbit_frame(*bounding_box(place), cameras)
@@ -109,9 +109,9 @@ def object_shots(
 
 
 def views_of(stand: OrbitFrame, views: Sequence[EvalView]) -> list[int]:
-    """Return the places of at most two views of an object, whole in the picture if it is in any, from sides far apart.
+    """Return the indices of at most two views of an object from sides far apart, which show all of it if possible.
 
-    The first is the one that shows it largest.
+    The first is the view that shows it largest.
     """
     whole: dict[int, tuple[int, float]] = {}
     for index, view in enumerate(views):
@@ -130,7 +130,7 @@ def views_of(stand: OrbitFrame, views: Sequence[EvalView]) -> list[int]:
 
 
 def alone(surfels: Surfels, camera: Camera, settings: RasterSettings, rasterizer: Rasterizer) -> np.ndarray:
-    """Return [H, W, 4] uint8: Gaussians rendered alone, straight alpha."""
+    """Return Gaussians rendered alone, [H, W, 4] uint8, straight alpha."""
     if len(surfels) == 0:
         return np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
     settings = replace(settings, geometry=False, distortion=False)
@@ -139,7 +139,7 @@ def alone(surfels: Surfels, camera: Camera, settings: RasterSettings, rasterizer
             surfel_inputs(surfels.detach(), camera), camera, settings, surfels.means.new_zeros(3)
         )
     alpha = render.alpha[..., None]
-    # Under 1/255 alpha is written as 0, so the bound only keeps the quotient finite.
+    # Alpha below 1/255 becomes 0, so this bound only keeps the quotient finite.
     return as_bytes(torch.cat([render.color / alpha.clamp(min=1 / 255), alpha], dim=-1))
 
 
@@ -151,13 +151,8 @@ def over_board(image: np.ndarray, size: int) -> np.ndarray:
     return (large[..., :3] * alpha + board * (1 - alpha)).round().astype(np.uint8)
 
 
-def as_bytes(image: Tensor) -> np.ndarray:
-    """Return a float image in 0..1 as uint8."""
-    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-
-
 def _in_view(view: EvalView, class_id: int, stages: Mapping[str, Surfels], drawing: Drawing) -> _Shot:
-    """Return the square of a view, at the size of its file, that holds the object at all stages and in truth."""
+    """Return the square of a view, at the resolution of its file, around the object at all stages and in truth."""
     truth, size = extracted_truth(view, class_id), (view.camera.height, view.camera.width)
     shown = np.zeros(size, dtype=bool) if truth is None else resize_nearest(truth.mask.cpu().numpy(), *size)
     window = _shown(shown, view.camera, drawing.settings, stages, drawing.rasterizer)
@@ -178,7 +173,7 @@ def _shown(
 
 
 def _photo(view: EvalView, full: Camera, window: Square) -> np.ndarray | None:
-    """Return [length, length, 3] uint8: the window of the photo's file; white outside of it."""
+    """Return the window of the photo's file, [length, length, 3] uint8; white outside of the photo."""
     top, left, length = window
     x0, y0, x1, y1 = max(left, 0), max(top, 0), min(left + length, full.width), min(top + length, full.height)
     if view.image is None or x0 >= x1 or y0 >= y1:
@@ -192,14 +187,14 @@ def _photo(view: EvalView, full: Camera, window: Square) -> np.ndarray | None:
 def _from_side(
     stand: OrbitFrame, caption: str, away: Tensor, pixels: int, stages: Mapping[str, Surfels], drawing: Drawing
 ) -> _Shot:
-    """Return the square that holds all that the object covers from a side, strays around it too."""
+    """Return the square around everything that the object covers from a side, also strays."""
     probe, settings = view_from(stand, away, _PROBE, _ROOM), orbit_settings(stand)
     top, left, length = _shown(np.zeros((_PROBE, _PROBE), dtype=bool), probe, settings, stages, drawing.rasterizer)
     return _Shot(caption, _sized(cropped(probe, left, top, length, length), pixels), settings)
 
 
 def _sized(camera: Camera, pixels: int) -> Camera:
-    """Return a square camera, of the same picture in at most so many pixels."""
+    """Return a square camera with the same picture in ``pixels`` x ``pixels``."""
     if camera.width == pixels:
         return camera
     factor = camera.K.new_tensor([[pixels / camera.width], [pixels / camera.width], [1.0]])

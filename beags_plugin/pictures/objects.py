@@ -1,4 +1,4 @@
-"""Objects alone before a plain background: sheets, comparisons and films."""
+"""Sheets, comparisons and films of objects alone before a plain background."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import torch
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.pictures.cells import GAP, below, beside, cell, checkerboard, wrapped
+from beags_plugin.pictures.cells import GAP, as_bytes, below, beside, cell, checkerboard, wrapped
 from beags_plugin.pictures.options import Background
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs
 
-_WIDTH = 1920  # of a sheet, pixels; what does not fit goes on below
+_WIDTH = 1920  # pixels of the width of a sheet; further cells go below
 
 Progress = Callable[[int, int], None]
 
@@ -24,8 +24,8 @@ Progress = Callable[[int, int], None]
 class Subject:
     """One object to show.
 
-    stages: caption to the Gaussians alone, such as {"before": ..., "after": ...}; {"": ...} for one. cameras: the same
-    for all stages. settings: their depth range.
+    stages: caption to the Gaussians alone, such as {"before": ..., "after": ...}, or {"": ...}. cameras: cameras for
+    all stages. settings: depth range of the cameras.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Subject:
 def render_alone(
     surfels: Surfels, camera: Camera, settings: RasterSettings, rasterizer: Rasterizer, background: Background
 ) -> np.ndarray:
-    """Return [H, W, 3] uint8: Gaussians before a background."""
+    """Return Gaussians before a background, [H, W, 3] uint8."""
     behind = torch.from_numpy(_behind(camera.height, camera.width, background))
     with torch.no_grad():
         if len(surfels) == 0:
@@ -45,7 +45,7 @@ def render_alone(
         inputs = surfel_inputs(surfels.detach(), camera)
         render = rasterizer.rasterize(inputs, camera, settings, surfels.means.new_zeros(3))
     color = render.color.cpu() + (1.0 - render.alpha.cpu())[..., None] * behind.float() / 255.0
-    return (color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    return as_bytes(color)
 
 
 def _behind(height: int, width: int, background: Background) -> np.ndarray:
@@ -57,7 +57,7 @@ def _behind(height: int, width: int, background: Background) -> np.ndarray:
 def film(
     subjects: Sequence[Subject], rasterizer: Rasterizer, background: Background, progress: Progress | None = None
 ) -> Iterator[np.ndarray]:
-    """Yield frames [H, W, 3] uint8 of even size: all subjects and stages beside each other."""
+    """Yield frames [H, W, 3] uint8 of even size with all subjects and stages beside each other."""
     count = len(subjects[0].cameras)
     for index in range(count):
         groups = [_stages(subject, index, rasterizer, background) for subject in subjects]
@@ -70,7 +70,7 @@ def film(
 def sheet(
     subjects: Sequence[Subject], rasterizer: Rasterizer, background: Background, progress: Progress | None = None
 ) -> np.ndarray:
-    """Return [H, W, 3] uint8: a line (or more) for each subject and stage, a picture for each camera."""
+    """Return [H, W, 3] uint8: one or more lines for each subject and stage, with a picture for each camera."""
     lines, done = [], 0
     total = sum(len(subject.cameras) * len(subject.stages) for subject in subjects)
     for subject in subjects:
@@ -90,7 +90,7 @@ def sheet(
 def comparison(
     subjects: Sequence[Subject], rasterizer: Rasterizer, background: Background, progress: Progress | None = None
 ) -> np.ndarray:
-    """Return [H, W, 3] uint8: subjects beside each other; of each the stages, a line for each camera."""
+    """Return [H, W, 3] uint8: subjects beside each other, each with its stages in a line for each camera."""
     blocks, done = [], 0
     total = sum(len(subject.cameras) for subject in subjects)
     for subject in subjects:
@@ -105,7 +105,7 @@ def comparison(
 
 
 def _stages(subject: Subject, index: int, rasterizer: Rasterizer, background: Background) -> list[np.ndarray]:
-    """Return a picture for each stage of a subject, from one of its cameras, under its caption if it has any."""
+    """Return a picture for each stage of a subject from one of its cameras, below its caption if there is one."""
     camera = subject.cameras[index]
     cells = []
     for stage, surfels in subject.stages.items():
@@ -120,6 +120,6 @@ def _caption(name: str, stage: str) -> str:
 
 
 def _even(picture: np.ndarray) -> np.ndarray:
-    """Return the picture with a white line more where a side is odd: films store colour for squares of 2 x 2 pixels."""
+    """Pad odd sides with a white line: films store colour for squares of 2 x 2 pixels."""
     height, width = picture.shape[:2]
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), constant_values=255)

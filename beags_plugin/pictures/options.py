@@ -1,4 +1,4 @@
-"""Options of pictures of objects."""
+"""Options for pictures of objects."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Background = Literal["white", "black", "checker"]
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """The way that the pictures are taken."""
+    """How the pictures are rendered."""
 
     camera_path: Path | None = None
     """A file that the viewer's tab Render has saved: a video along it, of its size and frames per second. Without
@@ -22,13 +22,13 @@ class RenderOptions:
     size: int | None = None
     """Pixels along each side of one picture; 480 in a video, 232 in a sheet, 400 before and after."""
     frames: int = 120
-    """Pictures of a turn in a video."""
+    """Frames of a turn in a video."""
     views: int = 8
     """Pictures of a turn in a sheet (before-after: half as many)."""
     fps: int = 30
     """Frames of a video per second."""
     elevation: float = 20.0
-    """Degrees from which the camera looks down."""
+    """Elevation of the camera above the horizon, degrees."""
     turn: float = 360.0
     """Degrees of the turn; less than 360 swings to and fro before the side that the photos show."""
     background: Background = "white"

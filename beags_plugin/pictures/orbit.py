@@ -1,4 +1,4 @@
-"""Cameras that go around an object."""
+"""Cameras on a circle around an object."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from beags_plugin.core.lifting import project
 from beags_plugin.rasterizers.interface import RasterSettings
 
 _FIELD_OF_VIEW = math.radians(35.0)
-_MARGIN = 1.06  # around what the widest picture of the turn shows of the box: discs reach beyond it
-_STEP = 5  # degrees between the sides of which one is chosen
-_NEAR, _FAR = 0.02, 100.0  # in units of the distance to the centre
+_MARGIN = 1.06  # factor on the box in the widest picture of the turn, as discs reach beyond the box
+_STEP = 5  # degrees between candidate sides
+_NEAR, _FAR = 0.02, 100.0  # depth range, in distances to the centre
 
 
 @dataclass(frozen=True)
 class OrbitFrame:
     """The place of an object, in the frame of its Gaussians.
 
-    center: [3] float64, which every camera looks at. up: [3] float64, unit. front: [3] float64, from where the photos
-    were taken, any length. corners: [8, 3] float64, of the box that the pictures hold.
+    center: [3] float64, at which every camera looks. up: [3] float64, unit. front: [3] float64, direction towards the
+    photos' cameras, any length. corners: [8, 3] float64, corners of the box that the pictures hold.
     """
 
     center: Tensor
@@ -39,14 +39,15 @@ class OrbitFrame:
 
     @property
     def distance(self) -> float:
-        """Return the cameras' distance from the centre, at which that ball fills the field of view."""
+        """Return the distance of cameras from the centre at which that ball fills the field of view."""
         return self.reach / math.sin(_FIELD_OF_VIEW / 2)
 
 
 def orbit_frame(low: Tensor, high: Tensor, cameras: Sequence[Camera] = ()) -> OrbitFrame:
-    """Return the place of a box; up is the mean of the cameras' ups, front their mean direction.
+    """Return the place of a box; up is the mean of the cameras' up axes, front their mean direction.
 
-    low, high: [3] corners. cameras: of the photos. Without cameras, z is up and -y the front, as in nerfstudio's frame.
+    low, high: [3] corners. cameras: the photos' cameras. Without any, z is up and -y the front, as in nerfstudio's
+    frame.
     """
     center = (low + high).double() / 2
     front = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
@@ -62,11 +63,11 @@ def orbit_frame(low: Tensor, high: Tensor, cameras: Sequence[Camera] = ()) -> Or
 
 
 def orbit(stand: OrbitFrame, count: int, pixels: int, elevation: float = 20.0, turn: float = 360.0) -> list[Camera]:
-    """Return cameras on a circle about the up axis, from the front on, at even angles; the box fills the widest
-    picture.
+    """Return cameras at even angles on a circle about the up axis; the box fills the widest picture.
 
-    count: of cameras. pixels: side of the square pictures. elevation: degrees above the horizon. turn: degrees; a whole
-    turn comes back to the start, less swings to and fro about the front. The cameras are float32.
+    count: number of cameras; the first looks from the front. pixels: side of the square pictures. elevation: degrees
+    above the horizon. turn: degrees; 360 is a whole turn, less swings to and fro about the front. The cameras are
+    float32.
     """
     cameras = []
     for index in range(count):
@@ -78,9 +79,9 @@ def orbit(stand: OrbitFrame, count: int, pixels: int, elevation: float = 20.0, t
 
 
 def side(stand: OrbitFrame, azimuth: float, elevation: float) -> Tensor:
-    """Return a side of the object: [3] float64, unit, from the centre on.
+    """Return the direction from the centre to a side of the object, [3] float64, unit.
 
-    azimuth: degrees about the up axis, from the front on. elevation: degrees above the horizon.
+    azimuth: degrees about the up axis, 0 at the front. elevation: degrees above the horizon.
     """
     right, forward = _horizon(stand)
     angle, height = math.radians(azimuth), math.radians(elevation)
@@ -89,9 +90,9 @@ def side(stand: OrbitFrame, azimuth: float, elevation: float) -> Tensor:
 
 
 def least_shown(stand: OrbitFrame, cameras: Sequence[Camera], elevation: float) -> float:
-    """Return the azimuth, whole degrees, of the side that no camera looks at the centre from, nor from near it.
+    """Return the azimuth, whole degrees, of the side that is farthest from all cameras that see the centre.
 
-    cameras: of the photos; those that do not have the centre in their picture do not count. 180 without any.
+    cameras: the photos' cameras. Without any that has the centre in its picture, the azimuth is 180.
     """
     shown = [camera for camera in cameras if shows(camera, stand.center)]
     if not shown:
@@ -103,13 +104,13 @@ def least_shown(stand: OrbitFrame, cameras: Sequence[Camera], elevation: float) 
 
 
 def view_from(stand: OrbitFrame, away: Tensor, pixels: int, room: float = 1.0) -> Camera:
-    """Return a square view of the centre from the side ``away`` [3], of which the box fills ``1 / room``."""
+    """Return a square view of the centre from the side ``away`` [3]; the box fills ``1 / room`` of it."""
     camera = _look_at(stand.center + stand.distance * away, stand, pixels)
     return _zoomed(camera, 1.0 / (room * _MARGIN * max(_reach(camera, stand.corners), 1e-3)))
 
 
 def orbit_settings(stand: OrbitFrame) -> RasterSettings:
-    """Return the depth range of the orbit's cameras, for colours only."""
+    """Return settings for the orbit's cameras: their depth range, colours only."""
     return RasterSettings(_NEAR * stand.distance, _FAR * stand.distance, geometry=False, distortion=False)
 
 
@@ -121,7 +122,7 @@ def shows(camera: Camera, point: Tensor) -> bool:
 
 
 def _reach(camera: Camera, points: Tensor) -> float:
-    """Return the largest distance of the points [P, 3] from the middle of a square picture; 1 is its border."""
+    """Return the largest distance of points [P, 3] from the middle of a square picture; 1 is the border."""
     xy, _ = project(points, camera)
     half = 0.5 * camera.width
     return float((xy - half).abs().max()) / half
@@ -134,11 +135,9 @@ def _zoomed(camera: Camera, factor: float) -> Camera:
 
 
 def _horizon(stand: OrbitFrame) -> tuple[Tensor, Tensor]:
-    """Return two unit vectors at right angles to the up axis: rightwards of the front, and from the front to the
-    object.
-    """
+    """Return two horizontal unit vectors: to the right as seen from the front, and from the front to the object."""
     level = stand.front - (stand.front @ stand.up) * stand.up
-    if float(level.norm()) < 1e-6 * max(float(stand.front.norm()), 1e-12):  # seen from straight above
+    if float(level.norm()) < 1e-6 * max(float(stand.front.norm()), 1e-12):  # the front is straight above
         axis = torch.zeros(3, dtype=torch.float64)
         axis[int(stand.up.abs().argmin())] = 1.0
         level = axis - (axis @ stand.up) * stand.up
@@ -147,10 +146,10 @@ def _horizon(stand: OrbitFrame) -> tuple[Tensor, Tensor]:
 
 
 def _look_at(eye: Tensor, stand: OrbitFrame, pixels: int) -> Camera:
-    """Return a square view of the centre from ``eye``, the up axis upwards."""
+    """Return a square view of the centre from ``eye`` with the up axis upwards."""
     forward = (stand.center - eye) / (stand.center - eye).norm()
     right = torch.linalg.cross(forward, stand.up)
-    if float(right.norm()) < 1e-9:  # from straight above: any side is up
+    if float(right.norm()) < 1e-9:  # the eye is straight above: any side may be up
         right = _horizon(stand)[0]
     right = right / right.norm()
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])  # OpenCV: x right, y down, z forward

@@ -1,4 +1,4 @@
-"""A picture of poses: cameras and points from above and from the side."""
+"""A picture of cameras and points from above and from the side."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 
 from beags_plugin.system.whole_files import write_whole
 
-_SHOWN = 20_000  # points
+_SHOWN = 20_000  # points that are drawn
 
 
 def draw_poses(path: Path, poses: np.ndarray, points: np.ndarray, colors: np.ndarray, title: str) -> None:
     """Write a .png of cameras [V, 4, 4], which look along -z, and points [P, 3] with colours [P, 3] uint8.
 
-    Up is the mean of the cameras' own; what lies far behind the cameras' surroundings is left out.
+    Up is the mean of the cameras' up axes; points far outside of the cameras' surroundings are cut off.
     """
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""Films: .mp4 through PyAV, .gif through Pillow."""
+"""Writers of films: .mp4 by PyAV, .gif by Pillow."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from beags_plugin.splat_io.files import whole_file
 from beags_plugin.system.errors import UserError
 
 FILMS = (".mp4", ".gif")
-_ENCODERS = ("libx264", "h264", "mpeg4")  # best first; the last is read by players, but not by browsers
+_ENCODERS = ("libx264", "h264", "mpeg4")  # best first; browsers do not read the last one
 REPAIR = "pip install --force-reinstall av"
 
 
 def encoder() -> str | None:
-    """Return the name of the encoder for .mp4 films; None if there is none here."""
+    """Return the name of an installed encoder for .mp4 films; None without any."""
     try:
         import av
     except ImportError:
@@ -26,7 +26,7 @@ def encoder() -> str | None:
     for name in _ENCODERS:
         try:
             av.codec.Codec(name, "w")  # type: ignore[attr-defined]
-        except ValueError:  # av's error for an unknown codec is one
+        except ValueError:  # av's error for an unknown codec is a ValueError
             continue
         return name
     return None
@@ -55,14 +55,14 @@ def _write_mp4(part: Path, frames: Iterable[np.ndarray], fps: int) -> None:
     import av
 
     name = encoder()
-    assert name is not None  # check_film has looked
+    assert name is not None  # check_film has checked it
     with av.open(str(part), "w", format="mp4", options={"movflags": "faststart"}) as container:
         stream: Any = None
         for frame in frames:
             if stream is None:
                 stream = container.add_stream(name, rate=Fraction(fps))
                 stream.height, stream.width = frame.shape[:2]
-                stream.pix_fmt = "yuv420p"  # the one that every player takes
+                stream.pix_fmt = "yuv420p"  # every player reads this format
                 if name == "libx264":
                     stream.options = {"crf": "18"}
                 else:

@@ -17,25 +17,25 @@ from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView, MaskKind
 from beags_plugin.evaluation.report import RunMetrics, Stage
 from beags_plugin.evaluation.run_metrics import MaskRenderer
-from beags_plugin.pictures.cells import GAP, Square, below, beside, cell, crop, printable, square_around
+from beags_plugin.pictures.cells import GAP, Square, as_bytes, below, beside, cell, crop, printable, square_around
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 
-RIGHT, MISSED, WRONG, LEFT_OUT = 1, 2, 3, 4  # of an error map; 0 is right too: outside of both masks
+RIGHT, MISSED, WRONG, LEFT_OUT = 1, 2, 3, 4  # codes of an error map; 0 is outside of both masks
 COLORS = {RIGHT: (0, 158, 115), MISSED: (0, 114, 178), WRONG: (213, 94, 0), LEFT_OUT: (150, 150, 150)}
-"""RGB; distinct for colour-blind eyes too (Okabe and Ito)."""
+"""RGB; also distinct for colour-blind people (Okabe and Ito)."""
 _MEANINGS = {RIGHT: "right", MISSED: "missed", WRONG: "wrong", LEFT_OUT: "not scored"}
 _KINDS: tuple[MaskKind, ...] = ("extracted", "rendered")
 _SIDE = 240  # pixels of a cell
-_LEGEND = 24  # pixels
-_GREY = 128  # where there is no photograph
+_LEGEND = 24  # pixels of the height of the legend
+_GREY = 128  # takes the place of a missing photograph
 
 
 @dataclass(frozen=True)
 class WorstMask:
     """One mask and its errors.
 
-    title: its origin, for the caption. photo: [h, w, 3] uint8, at the size at which the masks are compared. errors:
-    stage to its error map [h, w] uint8. metrics: stage to its figures.
+    title: caption. photo: [h, w, 3] uint8, at the size at which masks are compared. errors: stage to its error map
+    [h, w] uint8. metrics: stage to its metrics.
     """
 
     title: str
@@ -46,16 +46,15 @@ class WorstMask:
 
     @property
     def score(self) -> float:
-        """Return the IoU of the latest state, by which masks are ranked."""
+        """Return the IoU of the final state, by which masks are ranked."""
         value = self.metrics["after"].iou
         return 1.0 if value is None else value
 
 
 def error_map(prediction: Tensor, truth: Tensor, ignore: Tensor | None, protocol: Protocol | None = None) -> np.ndarray:
-    """Return [h, w] uint8: RIGHT in both masks, MISSED in the truth only, WRONG in the prediction only, LEFT_OUT, else
-    0.
+    """Return [h, w] uint8: RIGHT in both masks, MISSED in the truth only, WRONG in the prediction only, else 0.
 
-    Arguments and size as of ``metrics.compared_masks``, so that the picture shows the pixels that are counted.
+    Pixels that do not count are LEFT_OUT. Arguments and size are those of ``metrics.compared_masks``.
     """
     predicted, true, counted = compared_masks(prediction, truth, ignore, protocol)
     errors = np.zeros(true.shape, dtype=np.uint8)
@@ -67,7 +66,7 @@ def error_map(prediction: Tensor, truth: Tensor, ignore: Tensor | None, protocol
 
 
 def paint(photo: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Return the photo [h, w, 3] uint8, half of it replaced by the colour of each error; 0 stays as it is."""
+    """Return the photo [h, w, 3] uint8, mixed by half with the colour of each error; 0 stays unchanged."""
     painted = photo.copy()
     for code, color in COLORS.items():
         there = errors == code
@@ -94,9 +93,9 @@ def draw_worst(
     count: int = 6,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[WorstMask]:
-    """Render the ``count`` worst masks of each kind again, without gradients.
+    """Render the ``count`` worst masks of each kind again.
 
-    run: the figures of these scenes and views. scenes: stage to the Gaussians and their classes. progress: receives
+    run: the metrics of these scenes and views. scenes: stage to the Gaussians and their classes. progress: receives
     (done, total) masks.
     """
     names = run.names()
@@ -121,19 +120,18 @@ def draw_worst(
 
 
 def _photo(view: EvalView, shape: tuple[int, ...]) -> np.ndarray:
-    """Return [h, w, 3] uint8: the photograph at the size of the masks; grey without one."""
+    """Return the photograph at the size of the masks, [h, w, 3] uint8; grey without one."""
     from PIL import Image
 
     if view.image is None:
         return np.full((*shape, 3), _GREY, dtype=np.uint8)
-    pixels = (view.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-    return np.asarray(Image.fromarray(pixels).resize((shape[1], shape[0]), Image.Resampling.BILINEAR))
+    return np.asarray(Image.fromarray(as_bytes(view.image)).resize((shape[1], shape[0]), Image.Resampling.BILINEAR))
 
 
 def worst_views_picture(masks: Sequence[WorstMask], count: int = 6) -> np.ndarray:
     """Return [H, W, 3] uint8: a legend, then the ``count`` worst masks of each kind, kinds beside each other.
 
-    Each mask has a line: the photograph, then its errors before and after refinement, cropped alike around the object.
+    Each mask has a line with the photograph and the errors before and after refinement, in the same crop.
     Raises ``ValueError`` without masks.
     """
     if not masks:
@@ -160,7 +158,7 @@ def _line(mask: WorstMask) -> np.ndarray:
 
 
 def error_window(mask: WorstMask) -> Square:
-    """Return the square that holds the object in truth and in every stage's prediction."""
+    """Return the square around the object in truth and in every stage's prediction."""
     touched = [np.isin(errors, (RIGHT, MISSED, WRONG)) for errors in mask.errors.values()]
     return square_around(np.logical_or.reduce(touched))
 
