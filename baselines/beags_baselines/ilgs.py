@@ -1,4 +1,4 @@
-"""ILGS as a refiner: identity codes and their classifier learn while the base trains on, but not from doubtful pixels.
+"""ILGS as a refiner: identity codes and their classifier are trained with the scene, except on doubtful pixels.
 
 Jang, Kim, "Identity-aware Language Gaussian Splatting for Open-vocabulary 3D Semantic Segmentation", ICCV 2025. Codes
 and classifier are those of Gaussian Grouping (``identity_codes``), with 256 outputs and without its term of neighbours.
@@ -12,49 +12,47 @@ which reaches codes, classifier and, through the blending weights, the geometry.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from beags_baselines import identity_codes
-from beags_baselines.learned_codes import LearnedCodes
+from beags_baselines.learned_codes import CodeTraining
 from beags_baselines.object_codebook import code_entropy, members_by_softmax
 from beags_plugin.core.membership import Membership
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.reduction import ordered_sum
 from beags_plugin.preparation.refiner import Refiner
-from beags_plugin.preparation.refiner_training import Edit, OwnTraining, Terms, TrainedScene
+from beags_plugin.preparation.refiner_training import OwnTraining, Terms, TrainedScene
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
 
-OUTPUTS = 256  # of the classifier; more if there are more classes
+OUTPUTS = 256  # least number of outputs of the classifier
 WEIGHT = 1.0
 LEAST_IN_HULL = 4
 
 
 def trusted_mean(entropies: Tensor, labelled: Tensor, share: float) -> Tensor:
-    """Return L. entropies: [P], CE, 0 where unlabelled. labelled: [P] bool, one at least. share: t, of the steps."""
+    """Return L. entropies: [P], CE, 0 if unlabelled. labelled: [P] bool, not all False. share: t of the run."""
     count = labelled.sum()
     bound = ordered_sum(entropies.detach()) / count * (2.0 - share)
     return ordered_sum(torch.where(entropies > bound, 0.0, entropies)) / count / math.log(identity_codes.NORMALISER)
 
 
 def inside_hull(means: Tensor, chosen: Tensor) -> Tensor:
-    """Return [N] bool, as ``identity_codes.inside_hull``, but of four at least, and of outliers too if no four stay."""
+    """Return ``identity_codes.inside_hull`` with ILGS' choices: four points suffice, and outliers may be among them."""
     return identity_codes.inside_hull(means, chosen, LEAST_IN_HULL, else_all=True)
 
 
 @dataclass(frozen=True)
 class IlgsRefiner(Refiner):
-    """Cuts every object out by the classes of codes in space; objects may overlap."""
+    """Takes objects out by the classes of the Gaussians' codes; objects may overlap."""
 
     weight: float = WEIGHT
-    """Weight of the cross-entropy; 0: the base trains on."""
+    """Weight of the cross-entropy; 0 trains the base only."""
     threshold: float = identity_codes.THRESHOLD
     """Least probability of an object."""
     hull: bool = identity_codes.HULL
@@ -73,18 +71,13 @@ class IlgsRefiner(Refiner):
         return IlgsTraining(scene, self)
 
 
-class IlgsTraining(OwnTraining):
-    """Trains the scene, a code of each Gaussian, and the classifier of drawn codes."""
+class IlgsTraining(CodeTraining):
+    """Trains the scene, a code of each Gaussian, and the classifier of rendered codes."""
 
     def __init__(self, scene: TrainedScene, options: IlgsRefiner) -> None:
-        self.scene, self.options = scene, options
-        self.ranks = ClassRanks(torch.tensor(list(scene.names), device=scene.surfels().means.device))
-        self.outputs = max(OUTPUTS, len(self.ranks))
-        self.learned = LearnedCodes(scene, self.outputs)
-
-    def before_step(self, step: int) -> Edit | None:
-        self.learned.adam.zero_grad()
-        return None
+        self.outputs = max(OUTPUTS, len(scene.names))
+        super().__init__(scene, self.outputs)
+        self.options = options
 
     def terms(self, inputs: LossInputs, step: int, base: Callable[[], Terms]) -> Terms:
         terms = base()
@@ -99,30 +92,17 @@ class IlgsTraining(OwnTraining):
         share = (step + 1) / self.scene.steps
         return {**terms, "identities": self.options.weight * trusted_mean(entropies, labelled, share)}
 
-    def after_step(self, step: int) -> Edit | None:
-        self.learned.step()
-        return None
-
     @torch.no_grad()
     def finish(self) -> Membership:
         surfels, ids, learned = self.scene.surfels().detach(), self.ranks.ids.tolist(), self.learned
         learned.say_right_pixels(surfels, self.ranks)
         owner = torch.full((self.outputs,), -1, device=surfels.means.device)
         owner[: len(ids)] = torch.arange(len(ids), device=owner.device)
-        found = members_by_softmax(learned.classifier, learned.codes, owner, len(ids), self.options.threshold)
+        objects = members_by_softmax(learned.classifier, learned.codes, owner, len(ids), self.options.threshold)
         if self.options.hull:
-            hulls = {rank: inside_hull(surfels.means, chosen) for rank, chosen in found.items()}
+            hulls = {rank: inside_hull(surfels.means, chosen) for rank, chosen in objects.items()}
             without = [self.scene.names[ids[rank]] for rank, inside in hulls.items() if not bool(inside.any())]
             if without:
-                say(f"  no hull, for want of Gaussians or as all lie in a plane: {', '.join(without)}")
-            found = {rank: chosen | hulls[rank] for rank, chosen in found.items()}
-        return Membership.of_masks({ids[rank]: chosen for rank, chosen in found.items()}, self.scene.class_ids())
-
-    def figures(self) -> Mapping[str, float]:
-        return self.learned.figures
-
-    def state(self) -> dict[str, Any]:
-        return self.learned.state()
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self.learned.restore(state)
+                say(f"  no hull, since there are too few Gaussians or all lie in a plane: {', '.join(without)}")
+            objects = {rank: chosen | hulls[rank] for rank, chosen in objects.items()}
+        return Membership.of_masks({ids[rank]: chosen for rank, chosen in objects.items()}, self.scene.class_ids())

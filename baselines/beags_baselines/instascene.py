@@ -1,9 +1,9 @@
 """InstaScene as a refiner: masks are tracked over a frozen base, and features are contrasted with the cleaned masks.
 
 Before the first step ``mask_tracking`` finds masks that hold several objects, and seeds of each object. Each step then
-draws unit features in one view and contrasts them (``prototypes``) with its masks but those; every tenth step does so
-in five views together, and every step contrasts the seeds' features in space. An object is what is like the mean of its
-seeds.
+renders unit features in one view and contrasts them (``prototypes``) with the masks of single objects. Every tenth step
+also does so in five views together, and every step contrasts the features of the seeds. The Gaussians of an object are
+those whose features are similar to the mean of its seeds.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import embedding
 
 from beags_baselines import mask_tracking, prototypes
-from beags_baselines.isolated_render import FrozenDrawing
+from beags_baselines.isolated_render import FeatureTraining
 from beags_plugin.core.membership import Membership
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.preparation.refiner import Refiner
 from beags_plugin.preparation.refiner_training import Edit, OwnTraining, Terms, TrainedScene
@@ -28,16 +28,16 @@ from beags_plugin.rasterizers.optional import optional_products
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import each_view, say
 
-RATE = 0.025  # of the features: Adam with eps 1e-15, constant
+RATE = 0.025  # learning rate of the features, constant
 SAMPLES = 32_768
-SINGLE, MULTI, SPACE, UNFILTERED = 0.5e-6, 1e-6, 2.5e-6, 1e-6  # weights; only their ratios matter to Adam
-TOGETHER, INTERVAL = 5, 10  # views that are contrasted together, in every tenth step
+SINGLE, MULTI, SPACE, UNFILTERED = 0.5e-6, 1e-6, 2.5e-6, 1e-6  # weights of terms; Adam depends on ratios only
+TOGETHER, INTERVAL = 5, 10  # views that are contrasted together, and steps from one such step to the next
 FEATURES, VIEWS, PROTOTYPES, PIXELS, ALL_PIXELS, SEVERAL, SEVERAL_PIXELS, SEEDS = range(8)  # purposes of random numbers
 
 
 @dataclass(frozen=True)
 class InstaSceneRefiner(Refiner):
-    """Takes the objects out of the base by learned features; they may overlap and leave Gaussians to nobody."""
+    """Takes objects out of the base by learned features; they may overlap, and Gaussians may belong to none."""
 
     consider_negative: bool = True
     """The background is a class."""
@@ -48,9 +48,9 @@ class InstaSceneRefiner(Refiner):
     min_gaussians: int = mask_tracking.MIN_GAUSSIANS
     """Gaussians of a mask that is tracked."""
     min_weight: float = mask_tracking.MIN_WEIGHT
-    """Blending weight of a traced Gaussian at a pixel."""
+    """Blending weight that a traced Gaussian exceeds."""
     cosine: float = prototypes.COSINE
-    """Least likeness to the object's prototype."""
+    """Least cosine with the object's prototype."""
     samples: int = SAMPLES
     """Samples of each term."""
 
@@ -77,26 +77,21 @@ class InstaSceneRefiner(Refiner):
         return ContrastTraining(scene, self)
 
 
-class ContrastTraining(OwnTraining):
-    """Trains a feature of each Gaussian; the scene stays as it is."""
+class ContrastTraining(FeatureTraining):
+    """Trains a feature of each Gaussian; the scene stays fixed."""
 
     def __init__(self, scene: TrainedScene, options: InstaSceneRefiner) -> None:
-        self.scene, self.options, self.drawing = scene, options, FrozenDrawing(scene)
-        count, device = len(self.drawing), self.drawing.inputs.means.device
-        self.ranks = ClassRanks(torch.tensor(list(scene.names), device=device))
-        self.masked = [view for view, labels in enumerate(scene.labels) if bool((labels != IGNORE).any())]
-        first = torch.rand(count, prototypes.CHANNELS, generator=scene.generator(0, FEATURES))
-        self.features = prototypes.unit(first.to(device)).requires_grad_()
-        self.adam = torch.optim.Adam([self.features], lr=RATE, eps=1e-15)
+        means = scene.surfels().means
+        first = torch.rand(len(means), prototypes.CHANNELS, generator=scene.generator(0, FEATURES))
+        super().__init__(scene, prototypes.unit(first.to(means.device)), RATE, VIEWS)
+        self.options = options
+        count, device = len(means), means.device
         self.tracked: mask_tracking.TrackedMasks | None = None
         self.seed_classes = torch.zeros(count, dtype=torch.int64, device=device)
         self.fixed: Tensor | None = None
         if options.gram_feat:
             self.fixed = prototypes.orthonormal(len(self.ranks), scene.generator(0, PROTOTYPES)).to(device)
-        self._visible: dict[int, np.ndarray] = {}  # bits of each view, as its Gaussians stay where they are
-
-    def rates(self, step: int) -> Mapping[str, float]:
-        return {}
+        self._visible: dict[int, np.ndarray] = {}  # packed bits of each view; the scene stays fixed
 
     def before_step(self, step: int) -> Edit | None:
         self.adam.zero_grad()
@@ -111,8 +106,8 @@ class ContrastTraining(OwnTraining):
     def terms(self, inputs: LossInputs, step: int, base: Callable[[], Terms]) -> Terms:
         if not self.masked or self.tracked is None:
             return {}
-        units, view = prototypes.unit(self.features), self._view(step)
-        drawn, ranks = self.drawing.channels(view, units), self._ranks(view)
+        units, view = prototypes.unit(self.features), self.view_of(step)
+        drawn, ranks = self.drawing.channels(view, units), self.ranks_of(view).flatten()
         filtered = self.tracked.filtered(view, ranks)
         least = 0 if self.options.consider_negative else 1
         terms = {"single": SINGLE * self._of_pixels([drawn], [filtered], least, step, PIXELS)}
@@ -121,18 +116,13 @@ class ContrastTraining(OwnTraining):
         if step % INTERVAL == 0:
             several = self._several(step)
             images = [self.drawing.channels(each, units) for each in several]
-            maps = [self._ranks(each) for each in several]
+            maps = [self.ranks_of(each).flatten() for each in several]
             terms["multi"] = MULTI * self._of_pixels(images, maps, 1, step, SEVERAL_PIXELS, self.fixed)
         seeds = ((self.seed_classes > 0) & self._seen(view)).nonzero()[:, 0]
         chosen = seeds[self._chosen(len(seeds), step, SEEDS)]
-        own = prototypes.rows_of(units, chosen)
+        own = embedding(chosen, units)
         terms["space"] = SPACE * prototypes.prototype_loss(own, self.seed_classes[chosen], self.fixed)
         return terms
-
-    def after_step(self, step: int) -> Edit | None:
-        if self.features.grad is not None:
-            self.adam.step()
-        return None
 
     @torch.no_grad()
     def finish(self) -> Membership:
@@ -140,13 +130,13 @@ class ContrastTraining(OwnTraining):
         masks, alone, without = {}, 0, 0
         for rank, class_id in enumerate(self.ranks.ids.tolist()):
             if class_id != 0 and rank < len(seeds):
-                masks[class_id], alike = prototypes.members(self.features, seeds[rank], self.options.cosine)
-                alone += bool(len(seeds[rank])) and not alike
+                masks[class_id], similar = prototypes.members(self.features, seeds[rank], self.options.cosine)
+                alone += bool(len(seeds[rank])) and not similar
                 without += not len(seeds[rank])
         suspect = len(self.tracked.suspect) if self.tracked is not None else 0
         say(
-            f"  tracking: {suspect} masks left out; {without} objects without seeds, which are empty, and {alone} that "
-            "nothing is like, which are their seeds"
+            f"  tracking: {suspect} masks left out; {without} objects without seeds are empty, and {alone} "
+            "consist of their seeds, as no Gaussian is similar"
         )
         return Membership.of_masks(masks, self.scene.class_ids())
 
@@ -168,15 +158,13 @@ class ContrastTraining(OwnTraining):
 
     @torch.no_grad()
     def _track(self) -> None:
-        """Trace the Gaussians of all views, and track their masks."""
+        """Trace the Gaussians in all views and track the masks."""
         scene, inputs, count = self.scene, self.drawing.inputs, len(self.ranks)
 
         def trace(view: int) -> mask_tracking.TracedView:
-            camera = scene.cameras[view]
-            labels = self._ranks(view).view(camera.height, camera.width)
-            what = (inputs, camera, scene.settings, labels, count, self.options.min_weight)
-            found = optional_products(scene.rasterizer).sparse_class_pixel_counts(*what)
-            return mask_tracking.TracedView.of_counts(*found, count)
+            inputs_of_view = (inputs, scene.cameras[view], scene.settings, self.ranks_of(view))
+            product = optional_products(scene.rasterizer).sparse_class_pixel_counts
+            return mask_tracking.TracedView.of_counts(*product(*inputs_of_view, count, self.options.min_weight), count)
 
         with scene.stage("Tracing Gaussians") as progress:
             views = list(each_view(len(scene.cameras), trace, progress))
@@ -185,39 +173,29 @@ class ContrastTraining(OwnTraining):
             numbers = (len(self.drawing), count, options.min_gaussians, options.ground_votes)
             self._take(mask_tracking.tracked_masks(views, *numbers, progress))
 
-    def _view(self, step: int) -> int:
-        """Return the view of a step: all that have a mask, in a new order each time."""
-        number, place = divmod(step, len(self.masked))
-        order = torch.randperm(len(self.masked), generator=self.scene.generator(number, VIEWS))
-        return self.masked[int(order[place])]
-
     def _several(self, step: int) -> list[int]:
-        """Return views in a row, in the order of their names; without those that have no mask."""
+        """Return up to ``TOGETHER`` views in a row by name, without those that have no mask."""
         count = len(self.scene.cameras)
         most = min(TOGETHER, count)
         start = int(torch.randint(count - most + 1, (), generator=self.scene.generator(step, SEVERAL)))
         return [view for view in range(start, start + most) if view in set(self.masked)]
 
-    def _ranks(self, view: int) -> Tensor:
-        """Return the map of a view [P] int32, ranks or IGNORE."""
-        return self.ranks.ranked_labels(self.scene.labels[view].to(self.features.device)).flatten()
-
     def _chosen(self, count: int, step: int, purpose: int) -> Tensor:
-        """Return ``samples`` of 0 .. count - 1, drawn with replacement; none of none."""
-        drawn = self.options.samples if count else 0
+        """Return ``samples`` random indices below ``count``, with replacement; none if ``count`` is 0."""
+        number = self.options.samples if count else 0
         generator = self.scene.generator(step, purpose)
-        return torch.randint(max(count, 1), (drawn,), generator=generator).to(self.features.device)
+        return torch.randint(max(count, 1), (number,), generator=generator).to(self.features.device)
 
     def _of_pixels(
         self, images: list[Tensor], maps: list[Tensor], least: int, step: int, purpose: int, fixed: Tensor | None = None
     ) -> Tensor:
-        """Return the loss of pixels drawn from all maps [P], of classes from ``least`` on; images: [P, C] each."""
+        """Return the loss of random pixels of all maps [P] with classes from ``least`` on; images: [P, C] each."""
         places = [((ranks >= least) & (ranks != IGNORE)).nonzero()[:, 0] for ranks in maps]
         chosen = self._chosen(sum(map(len, places)), step, purpose)
         features, classes, first = [], [], 0
         for image, ranks, own in zip(images, maps, places, strict=True):
             mine = own[chosen[(chosen >= first) & (chosen < first + len(own))] - first]
-            features.append(prototypes.rows_of(image, mine))
+            features.append(embedding(mine, image))  # its gradient is the same for any number of threads
             classes.append(ranks[mine].long())
             first += len(own)
         if not features:
@@ -225,7 +203,7 @@ class ContrastTraining(OwnTraining):
         return prototypes.prototype_loss(torch.cat(features), torch.cat(classes), fixed)
 
     def _seen(self, view: int) -> Tensor:
-        """Return which Gaussians reach the image of a view, [N] bool."""
+        """Return [N] bool: the Gaussians that reach the image of a view."""
         if view not in self._visible:
             self._visible[view] = np.packbits(self.drawing.visible(view).cpu().numpy())
         bits = np.unpackbits(self._visible[view], count=len(self.drawing))

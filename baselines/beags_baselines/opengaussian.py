@@ -1,16 +1,16 @@
 """OpenGaussian as a refiner: features of a frozen base, codebooks of them, and classes of their leaves.
 
-The steps have three stages (``instance_features``). In the first, a quarter, features agree within masks and differ
-between them. In the second, a quarter, k-means of features and positions makes ``coarse`` clusters, which are drawn
-with the features of their centres and pulled towards the masks' means. In the third the features of one cluster after
-the other are clustered again, into leaves, and pulled alike with the cluster drawn alone. In the end each leaf, drawn
-alone in every view, is matched with a mask (``leaf_labels``).
+Training has three stages (``instance_features``). In the first, a quarter of the steps, features learn to agree within
+masks and to differ between them. In the second, also a quarter, k-means of features and positions makes ``coarse``
+clusters; each is rendered with the feature of its centre, which is pulled towards the masks' means. In the third, one
+cluster after the other is divided into leaves and trained in the same way, rendered alone. At the end each leaf is
+rendered alone in every view and matched with a mask (``leaf_labels``).
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import log
 from typing import Any
@@ -21,10 +21,8 @@ from torch.nn.functional import embedding
 
 from beags_baselines import instance_features as parts
 from beags_baselines import leaf_labels
-from beags_baselines.isolated_render import FrozenDrawing
+from beags_baselines.isolated_render import FeatureTraining
 from beags_plugin.core.membership import Membership
-from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.preparation.refiner import Refiner
 from beags_plugin.preparation.refiner_training import Edit, OwnTraining, Terms, TrainedScene
@@ -32,18 +30,18 @@ from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.progress import say
 
 FULL_STEPS = 40_000
-FASTEST = 10.0  # bound of the factor of the rates in short runs
-RATES = (1e-3, 1e-4, 1e-3)  # of the features by stage: Adam with eps 1e-15
-COARSE_INTERVAL, FINE_INTERVAL, TURN = 200, 50, 300  # steps of 40,000: between updates, and for a cluster
-LEAST_SIZE = 1e-3  # factor of the sizes of a draw
-SHOWS = 0.8  # largest alpha of what is drawn alone, above which it shows in a view
-CLUSTER_SILHOUETTE, LEAF_SILHOUETTE = 0.9, 0.8  # alpha alone
+FASTEST = 10.0  # largest factor on the rates in short runs
+RATES = (1e-3, 1e-4, 1e-3)  # learning rates of the features by stage
+COARSE_INTERVAL, FINE_INTERVAL, TURN = 200, 50, 300  # steps of 40,000 between updates, and for each cluster
+LEAST_SIZE = 1e-3  # least random factor on the sizes of Gaussians
+SHOWS = 0.8  # largest alpha of a cluster or leaf rendered alone above which a view shows it
+CLUSTER_SILHOUETTE, LEAF_SILHOUETTE = 0.9, 0.8  # alpha above which a pixel belongs to the silhouette
 VIEWS, FEATURES, COARSE, FINE, SIZES = range(5)  # purposes of random numbers
 
 
 @dataclass(frozen=True)
 class OpenGaussianRefiner(Refiner):
-    """Gives leaves of Gaussians the class of the masks that they look like; a Gaussian has one class or none."""
+    """Gives leaves of Gaussians the class of the masks that they resemble; a Gaussian has one class or none."""
 
     coarse: int = 64
     """Clusters."""
@@ -56,9 +54,9 @@ class OpenGaussianRefiner(Refiner):
     exclude_dropped: bool = False
     """Leaves out masks whose features disagree."""
     min_gaussians: int = 100
-    """Gaussians by which a cluster shows in a view; small scenes need fewer."""
+    """Gaussians of a cluster that a view must show; small scenes need fewer."""
     max_scale: float = 0.5
-    """Largest size of these, units of the input poses."""
+    """Largest size of these Gaussians, units of the input poses."""
     rule: str = leaf_labels.RULES[0]
     """Rule of extraction: classes or query."""
     min_views: int = leaf_labels.MIN_VIEWS
@@ -84,19 +82,15 @@ class OpenGaussianRefiner(Refiner):
         return CodebookTraining(scene, self)
 
 
-class CodebookTraining(OwnTraining):
-    """Trains a feature of each Gaussian; the scene stays as it is."""
+class CodebookTraining(FeatureTraining):
+    """Trains a feature of each Gaussian; the scene stays fixed."""
 
     def __init__(self, scene: TrainedScene, options: OpenGaussianRefiner) -> None:
-        self.scene, self.options = scene, options
-        self.drawing = FrozenDrawing(scene)
-        count, device = len(self.drawing), self.drawing.inputs.means.device
-        self.ranks = ClassRanks(torch.tensor(list(scene.names), device=device))
-        self.masked = [view for view, labels in enumerate(scene.labels) if bool((labels != IGNORE).any())]
+        count, device = len(scene.surfels().means), scene.surfels().means.device
         first = torch.rand(count, parts.CHANNELS, generator=scene.generator(0, FEATURES))
-        self.features = first.to(device).requires_grad_()
-        self.adam = torch.optim.Adam([self.features], eps=1e-15)
-        self.starts = (0, scene.steps // 4, scene.steps // 2)  # of the stages
+        super().__init__(scene, first, RATES[0], VIEWS)
+        self.options = options
+        self.starts = (0, scene.steps // 4, scene.steps // 2)  # first steps of the stages
         share = scene.steps / FULL_STEPS
         fine_steps = scene.steps - self.starts[2]
         self.turn_steps = min(TURN, max(fine_steps // options.coarse, 1))
@@ -116,9 +110,6 @@ class CodebookTraining(OwnTraining):
     def stage(self, step: int) -> int:
         """Return the stage of a step, 0 to 2."""
         return sum(step >= start for start in self.starts) - 1
-
-    def rates(self, step: int) -> Mapping[str, float]:
-        return {}
 
     def before_step(self, step: int) -> Edit | None:
         self.adam.param_groups[0]["lr"] = min(FULL_STEPS / self.scene.steps, FASTEST) * RATES[self.stage(step)]
@@ -141,7 +132,7 @@ class CodebookTraining(OwnTraining):
     def terms(self, inputs: LossInputs, step: int, base: Callable[[], Terms]) -> Terms:
         if not self.masked:
             return {}
-        view, stage, size = self._view(step), self.stage(step), self._size(step)
+        view, stage, size = self.view_of(step), self.stage(step), self._size(step)
         masks, labels = self._masks(view), self.masks.of(view)
         if stage == 0:
             return self._first_terms(view, masks, late=2 * step >= self.starts[1])
@@ -168,14 +159,8 @@ class CodebookTraining(OwnTraining):
         close = parts.cohesion(drawn, means, masks)
         return {"cohesion": self.options.cohesion_weight * close, "separation": parts.separation(means, late)}
 
-    def _view(self, step: int) -> int:
-        """Return the view of a step: all that have a mask, in a new order each time."""
-        number, place = divmod(step, len(self.masked))
-        order = torch.randperm(len(self.masked), generator=self.scene.generator(number, VIEWS))
-        return self.masked[int(order[place])]
-
     def _size(self, step: int) -> float:
-        """Return the factor of the sizes of all Gaussians in a step: 1 in half of them."""
+        """Return the factor on the sizes of all Gaussians in a step: 1 in half of the steps."""
         shrinks, factor = torch.rand(2, generator=self.scene.generator(step, SIZES)).tolist()
         return max(factor, LEAST_SIZE) if shrinks < 0.5 else 1.0
 
@@ -185,27 +170,26 @@ class CodebookTraining(OwnTraining):
         return place, turns % self.options.coarse
 
     def _masks(self, view: int) -> parts.MaskedPixels:
-        labels = self.scene.labels[view].to(self.features.device)
-        return parts.MaskedPixels.of(self.ranks.ranked_labels(labels))
+        return parts.MaskedPixels.of(self.ranks_of(view))
 
     def _vectors(self) -> Tensor:
-        """Return [N, 9], features beside weighted positions in units of the input poses."""
+        """Return [N, 9]: features and weighted positions, in units of the input poses."""
         positions = self.drawing.inputs.means * (self.options.position_weight / self.scene.scale)
         return torch.cat([self.features.detach(), positions], dim=1)
 
     @torch.no_grad()
     def _take_pseudo_masks(self) -> None:
-        found, shown = [], parts.drawn_form(self.features)
+        found, form = [], parts.drawn_form(self.features)
         with self.scene.stage("Averaging features") as progress:
             for done, view in enumerate(self.masked, start=1):
-                drawn, _ = self.drawing.draw(view, shown)
+                drawn, _ = self.drawing.draw(view, form)
                 found.append(parts.PseudoMasks.of_view(view, drawn, self._masks(view)))
                 progress(done, len(self.masked))
         self.masks = parts.PseudoMasks.joined(found) if found else self.masks
 
     @torch.no_grad()
     def _begin_leaves(self, generator: torch.Generator) -> None:
-        """Find in which views each cluster shows, and how many leaves it gets; choose centres from the whole scene."""
+        """Find the views that show each cluster and its number of leaves; choose centres from the whole scene."""
         self._take_pseudo_masks()
         book, options, drawing = self.book, self.options, self.drawing
         largest = drawing.inputs.log_scales.max(dim=1).values
@@ -235,23 +219,18 @@ class CodebookTraining(OwnTraining):
             book.fine[cluster, :used], local = parts.lloyd(self.features.detach()[own], book.fine[cluster, :used])
             book.leaves[own] = cluster * self.options.fine + local
 
-    def after_step(self, step: int) -> Edit | None:
-        if self.features.grad is not None:
-            self.adam.step()
-        return None
-
     @torch.no_grad()
     def finish(self) -> Membership:
         options, leaves, votes = self.options, self.book.leaves, self._votes()
         shown = torch.zeros_like(self.scene.class_ids())
         if options.rule == "classes":
-            table = shown.new_zeros(options.coarse * options.fine + 1)  # the last: in no leaf
+            table = shown.new_zeros(options.coarse * options.fine + 1)  # the last entry stands for Gaussians in no leaf
             named = leaf_labels.classes_of_leaves(votes, options.min_views)
             for leaf, rank in named.items():
                 table[leaf] = self.ranks.ids[rank]
             inside = float(torch.isin(leaves, leaves.new_tensor(list(named))).double().mean())
-            like = f"{len(named)} of {len(torch.unique(leaves))} look like a mask in {options.min_views} views or more"
-            say(f"  leaves: {like}; they hold {inside:.0%} of the Gaussians, and the others have no class")
+            like = f"{len(named)} of {len(torch.unique(leaves))} resemble a mask in {options.min_views} views or more"
+            say(f"  leaves: {like}; they hold {inside:.0%} of the Gaussians; the others have no class")
             return Membership(table[leaves])
         masks, surfels, centres = {}, self.scene.surfels().detach(), self.book.fine.flatten(0, 1)
         for rank, class_id in enumerate(self.ranks.ids.tolist()):
@@ -262,7 +241,7 @@ class CodebookTraining(OwnTraining):
         return Membership.of_masks(masks, shown)
 
     def _votes(self) -> leaf_labels.Votes:
-        """Draw every leaf alone in every view in which its cluster shows; return what it looks like there."""
+        """Render every leaf alone in every view that shows its cluster; return the classes of matching masks."""
         book, drawing, options = self.book, self.drawing, self.options
         shown, votes = parts.drawn_form(self.features), {}
         with self.scene.stage("Matching leaves") as progress:

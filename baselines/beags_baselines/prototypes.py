@@ -1,4 +1,4 @@
-"""InstaScene's contrast of features with the means of their classes, and its choice of members by them.
+"""InstaScene's loss between features and the means of their classes, and its choice of members by these means.
 
 With features E_a of samples a, g = E / (|E| + 1e-9), whose norm has no gradient, and u_c the mean of g over the n_c
 samples of class c, not of unit length,
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import embedding
 
 from beags_plugin.losses.reduction import grouped_sums, ordered_linear, ordered_sum
 
@@ -20,7 +19,7 @@ COSINE = 0.9
 
 
 def prototype_loss(features: Tensor, classes: Tensor, prototypes: Tensor | None = None) -> Tensor:
-    """Return P of samples; 0 of none.
+    """Return P of samples; 0 without samples.
 
     features: [S, C]. classes: [S] int64, ranks. prototypes: [K, C], fixed u_c in place of the samples' means.
     """
@@ -37,7 +36,7 @@ def prototype_loss(features: Tensor, classes: Tensor, prototypes: Tensor | None 
 
 
 def temperatures(g: Tensor, u: Tensor, places: Tensor, counts: Tensor) -> Tensor:
-    """Return phi [K] of classes without gradient; g: [S, C]. u: [K, C]. places: [S], of each the class. counts: [K]."""
+    """Return phi [K] without gradient. g: [S, C]. u: [K, C]. places: [S], the class of each sample. counts: [K]."""
     with torch.no_grad():
         residuals = (g - u[places]).square().sum(dim=1, keepdim=True).sqrt()
         sums = grouped_sums(residuals, places, len(u))[:, 0]
@@ -49,30 +48,26 @@ def unit(features: Tensor) -> Tensor:
     return features / (features.square().sum(dim=1, keepdim=True).clamp_min(1e-24).sqrt() + 1e-6)
 
 
-def rows_of(features: Tensor, rows: Tensor) -> Tensor:
-    """Return features[rows]; its gradient is that of any number of threads."""
-    return embedding(rows, features)
-
-
 def orthonormal(count: int, generator: torch.Generator) -> Tensor:
-    """Return [count, 16], count at most 16, by Gram-Schmidt of random vectors."""
+    """Return [count, 16] orthonormal rows from random vectors; count is at most 16."""
     random = torch.randn(CHANNELS, count, generator=generator, dtype=torch.float64)
     return torch.linalg.qr(random)[0].T.float().contiguous()
 
 
 def members(features: Tensor, seeds: Tensor, cosine: float = COSINE) -> tuple[Tensor, bool]:
-    """Return which of N Gaussians belong to an object, [N] bool, and whether anybody is like it.
+    """Return the members of an object, [N] bool, and whether any Gaussian is similar to it.
 
-    A member's unit feature has a product of at least ``cosine`` with the mean of the seeds', which is shorter the
-    looser these are; if there is none, the seeds are the members. features: [N, C]. seeds: [S] int64.
+    A Gaussian is similar if its unit feature has a product of at least ``cosine`` with the mean of the seeds' unit
+    features, which is the shorter the more these differ. If none is, the seeds are the members. features: [N, C].
+    seeds: [S] int64.
     """
-    found = torch.zeros(len(features), dtype=torch.bool, device=features.device)
+    inside = torch.zeros(len(features), dtype=torch.bool, device=features.device)
     if not len(seeds):
-        return found, False
+        return inside, False
     units = unit(features)
     mean = grouped_sums(units[seeds], torch.zeros_like(seeds), 1)[0] / len(seeds)
-    found = (units * mean).sum(dim=1) >= cosine
-    if bool(found.any()):
-        return found, True
-    found[seeds] = True
-    return found, False
+    inside = (units * mean).sum(dim=1) >= cosine
+    if bool(inside.any()):
+        return inside, True
+    inside[seeds] = True
+    return inside, False

@@ -1,26 +1,24 @@
-"""Unified-Lift as a refiner: codes and a codebook of objects learn on the base, which stays (``object_codebook``).
+"""Unified-Lift as a refiner: codes and a codebook of objects are trained on a frozen base (``object_codebook``).
 
-The source trains both beside the scene; as their terms leave its geometry alone, training them after it differs by the
-start alone.
+The source trains both together with the scene. Their terms do not reach the geometry, so that training them afterwards
+differs in the start only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from beags_baselines import identity_codes, object_codebook
-from beags_baselines.learned_codes import LearnedCodes
+from beags_baselines.learned_codes import CodeTraining
 from beags_plugin.core.membership import Membership
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.preparation.refiner import Refiner
-from beags_plugin.preparation.refiner_training import Edit, OwnTraining, Terms, TrainedScene
+from beags_plugin.preparation.refiner_training import OwnTraining, Terms, TrainedScene
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.progress import say
 
@@ -29,7 +27,7 @@ SAMPLES = 0  # purpose of random numbers
 
 @dataclass(frozen=True)
 class UnifiedLiftRefiner(Refiner):
-    """Cuts every object out of the base by the codes of the codebook that are its own."""
+    """Takes every object out of the base by the codes of the codebook that belong to it."""
 
     codes: int = object_codebook.CODES
     """Codes of the codebook, at least one for each class."""
@@ -58,17 +56,12 @@ class UnifiedLiftRefiner(Refiner):
         return CodebookTraining(scene, self)
 
 
-class CodebookTraining(OwnTraining):
-    """Trains a code of each Gaussian and the codebook, and nothing of the scene."""
+class CodebookTraining(CodeTraining):
+    """Trains a code of each Gaussian and the codebook; the scene stays fixed."""
 
     def __init__(self, scene: TrainedScene, options: UnifiedLiftRefiner) -> None:
-        self.scene, self.options = scene, options
-        self.ranks = ClassRanks(torch.tensor(list(scene.names), device=scene.surfels().means.device))
-        self.learned = LearnedCodes(scene, options.codes, bias=False)
-
-    def before_step(self, step: int) -> Edit | None:
-        self.learned.adam.zero_grad()
-        return None
+        super().__init__(scene, options.codes, bias=False)
+        self.options = options
 
     def terms(self, inputs: LossInputs, step: int, base: Callable[[], Terms]) -> Terms:
         if inputs.labels is None:
@@ -79,8 +72,8 @@ class CodebookTraining(OwnTraining):
             return {}
         drawn = self.learned.drawn(inputs.surfels.detach(), inputs.camera).flatten(0, 1)
         places = labelled.nonzero()[:, 0]
-        of_codes = self._terms_of_codes(drawn, labels, places, self.scene.generator(step, SAMPLES))
-        terms = {**of_codes, **self._terms_of_codebook(drawn.detach()[places], labels[places].long())}
+        code_terms = self._terms_of_codes(drawn, labels, places, self.scene.generator(step, SAMPLES))
+        terms = {**code_terms, **self._terms_of_codebook(drawn.detach()[places], labels[places].long())}
         return {name: object_codebook.WEIGHTS[name] * value for name, value in terms.items()}
 
     def _terms_of_codes(self, drawn: Tensor, labels: Tensor, places: Tensor, generator: torch.Generator) -> Terms:
@@ -93,7 +86,7 @@ class CodebookTraining(OwnTraining):
         }
 
     def _terms_of_codebook(self, drawn: Tensor, labels: Tensor) -> Terms:
-        """Return the terms of labelled pixels: drawn [P, C] without gradient, labels [P] ranks."""
+        """Return the terms of labelled pixels; drawn: [P, C] without gradient. labels: [P] ranks."""
         codes, codebook = self.options.codes, self.learned.classifier
         ids, group = torch.unique(labels, return_inverse=True)
         masses, largest = object_codebook.code_masses(codebook, drawn, group, len(ids), codes)
@@ -101,15 +94,11 @@ class CodebookTraining(OwnTraining):
         counted = object_codebook.reliable(drawn, group, len(ids)).nonzero()[:, 0]
         if len(counted) == 0:
             return {}
-        drawn, wanted = drawn[counted], targets[counted]
-        terms = {"concentration": object_codebook.concentration(codebook.weight, drawn, wanted)}
+        drawn, own_codes = drawn[counted], targets[counted]
+        terms = {"concentration": object_codebook.concentration(codebook.weight, drawn, own_codes)}
         if bool((largest != targets).any()):
-            terms["classes"] = object_codebook.selection(codebook, drawn, wanted, codes)
+            terms["classes"] = object_codebook.selection(codebook, drawn, own_codes, codes)
         return terms
-
-    def after_step(self, step: int) -> Edit | None:
-        self.learned.step()
-        return None
 
     @torch.no_grad()
     def finish(self) -> Membership:
@@ -121,18 +110,18 @@ class CodebookTraining(OwnTraining):
         owned, used = torch.unique(owner[owner >= 0]).tolist(), int((tables.sum(dim=0) > 0).sum())
         seen = (tables.sum(dim=1) > 0).tolist()
         lost = [scene.names[c] for rank, c in enumerate(self.ranks.ids.tolist()) if seen[rank] and rank not in owned]
-        without = f"; none is of {', '.join(lost)}: train longer (refine_steps)" if lost else ""
-        say(f"  codebook: {used} codes are used, {int((owner >= 0).sum())} of them are of one class{without}")
+        without = f"; none belongs to {', '.join(lost)}: train longer (refine_steps)" if lost else ""
+        say(f"  codebook: {used} codes are used, {int((owner >= 0).sum())} of them belong to one class{without}")
         if options.rule == "argmax":
             return Membership(self.ranks.class_ids(object_codebook.ranks_by_argmax(codebook, codes, owner)))
-        found = object_codebook.members_by_softmax(codebook, codes, owner, len(self.ranks), options.threshold)
+        objects = object_codebook.members_by_softmax(codebook, codes, owner, len(self.ranks), options.threshold)
         means, ids = scene.surfels().means, self.ranks.ids.tolist()
         if options.hull:
-            found = {rank: chosen | identity_codes.inside_hull(means, chosen) for rank, chosen in found.items()}
-        return Membership.of_masks({ids[rank]: chosen for rank, chosen in found.items()}, scene.class_ids())
+            objects = {rank: chosen | identity_codes.inside_hull(means, chosen) for rank, chosen in objects.items()}
+        return Membership.of_masks({ids[rank]: chosen for rank, chosen in objects.items()}, scene.class_ids())
 
     def _tables(self) -> Iterator[Tensor]:
-        """Yield, per training view, how many labelled pixels of each class get each code, [K, codes] int64."""
+        """Yield for each training view the labelled pixels of each class that get each code, [K, codes] int64."""
         scene, codes, surfels = self.scene, self.options.codes, self.scene.surfels().detach()
         with scene.stage("Giving codes to classes") as progress:
             for index, camera in enumerate(scene.cameras):
@@ -144,9 +133,3 @@ class CodebookTraining(OwnTraining):
                     keys = labels[places].long() * codes + largest
                     yield torch.bincount(keys, minlength=len(self.ranks) * codes).view(-1, codes)
                 progress(index + 1, len(scene.cameras))
-
-    def state(self) -> dict[str, Any]:
-        return self.learned.state()
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self.learned.restore(state)

@@ -31,7 +31,7 @@ def trained(steps: int = 0, **options) -> IdentityTraining:
 
 def test_the_masks_reach_codes_classifier_and_geometry():
     training = trained()
-    scene, before = training.scene, training.identities.codes.detach().clone()
+    scene, before = training.scene, training.learned.codes.detach().clone()
     training.before_step(1)
     terms = training.terms(loss_inputs(scene), 1, lambda: {"photometric": torch.zeros(())})
     assert set(terms) == {"photometric", "identities"}
@@ -42,9 +42,9 @@ def test_the_masks_reach_codes_classifier_and_geometry():
         assert gradient.abs().max() > 1e-6 and not gradient[-1].any(), name
     assert surfels.sh_dc.grad is None or not surfels.sh_dc.grad.any()  # codes are drawn in place of colours
     training.after_step(1)
-    moved = (training.identities.codes.detach() != before).any(dim=1)
+    moved = (training.learned.codes.detach() != before).any(dim=1)
     assert moved[:-1].sum() > 60 and not moved[-1]  # the last one is seen by nobody
-    assert all(values.grad.any() for values in training.identities.classifier.parameters())
+    assert all(values.grad.any() for values in training.learned.classifier.parameters())
 
 
 def test_neighbours_come_every_fifth_step_and_leave_the_geometry():
@@ -52,9 +52,7 @@ def test_neighbours_come_every_fifth_step_and_leave_the_geometry():
     training.before_step(5)
     found = {step: training.terms(loss_inputs(training.scene), step, dict) for step in range(5, 11)}
     assert [step for step, terms in found.items() if "neighbours" in terms] == [5, 10]
-    (early,), (late,) = (
-        torch.autograd.grad(found[step]["neighbours"], [training.identities.codes]) for step in (5, 10)
-    )
+    (early,), (late,) = (torch.autograd.grad(found[step]["neighbours"], [training.learned.codes]) for step in (5, 10))
     assert early[-1].any() and not torch.equal(early, late)  # other anchors
     found[5] = training.terms(loss_inputs(training.scene), 5, dict)
     found[5]["neighbours"].backward()
@@ -63,19 +61,19 @@ def test_neighbours_come_every_fifth_step_and_leave_the_geometry():
 
 def test_a_step_without_mask_and_neighbours_leaves_all_as_it_is():
     training = trained(3)
-    before = [values.detach().clone() for values in training.identities.learned]
+    before = [values.detach().clone() for values in training.learned.parameters]
     stepped(training, range(6, 9), masked=False)
-    assert all(torch.equal(values, old) for values, old in zip(training.identities.learned, before, strict=True))
+    assert all(torch.equal(values, old) for values, old in zip(training.learned.parameters, before, strict=True))
     stepped(training, range(10, 11), masked=False)
-    assert not any(torch.equal(values, old) for values, old in zip(training.identities.learned, before, strict=True))
+    assert not any(torch.equal(values, old) for values, old in zip(training.learned.parameters, before, strict=True))
 
 
 def test_short_runs_learn_faster():
-    rates = [[group["lr"] for group in trained().identities.adam.param_groups]]
+    rates = [[group["lr"] for group in trained().learned.adam.param_groups]]
     training = IdentityTraining(trained_scene(steps=15_000), GaussianGroupingRefiner())
-    rates.append([group["lr"] for group in training.identities.adam.param_groups])
+    rates.append([group["lr"] for group in training.learned.adam.param_groups])
     assert rates == [pytest.approx([0.025, 0.005]), pytest.approx([0.005, 0.001])]
-    assert [group["eps"] for group in training.identities.adam.param_groups] == [1e-15, 1e-8]
+    assert [group["eps"] for group in training.learned.adam.param_groups] == [1e-15, 1e-8]
 
 
 def test_codes_learn_the_masks_and_leave_objects_that_overlap(capsys):
@@ -91,7 +89,7 @@ def test_codes_learn_the_masks_and_leave_objects_that_overlap(capsys):
     everything = IdentityTraining(scene, GaussianGroupingRefiner(threshold=0.0))
     everything.restore(training.state())
     overlapping = everything.finish()
-    assert all(len(each) == len(training.identities.codes) for each in overlapping.objects.values())
+    assert all(len(each) == len(training.learned.codes) for each in overlapping.objects.values())
     assert set(overlapping.class_ids.tolist()) == set(FAR_APART[1:])
 
 

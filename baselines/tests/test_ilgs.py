@@ -114,7 +114,7 @@ def test_the_masks_reach_codes_classifier_and_geometry():
         gradient = getattr(surfels, name).grad
         assert gradient.abs().max() > 1e-6 and not gradient[-1].any(), name
     assert surfels.sh_dc.grad is None or not surfels.sh_dc.grad.any()
-    assert all(values.grad is not None and values.grad.any() for values in training.learned.learned)
+    assert all(values.grad is not None and values.grad.any() for values in training.learned.parameters)
     assert training.learned.classifier.weight.shape == (256, 16)
     twice = IlgsTraining(training.scene, IlgsRefiner(weight=2.0)).terms(loss_inputs(training.scene), 0, dict)
     assert twice["identities"].item() == pytest.approx(2 * found["identities"].item())
@@ -139,10 +139,10 @@ def test_without_weight_or_mask_the_base_just_trains_on():
     assert trained(weight=0.0).terms(loss_inputs(scene), 0, lambda: given) == given
     assert unmasked.terms(loss_inputs(scene, masked=False), 0, lambda: given) == given
     assert unmasked.terms(loss_inputs(blank), 0, lambda: given) == given
-    before = [values.detach().clone() for values in unmasked.learned.learned]
+    before = [values.detach().clone() for values in unmasked.learned.parameters]
     unmasked.before_step(0)
     unmasked.after_step(0)
-    assert all(torch.equal(a, b) for a, b in zip(before, unmasked.learned.learned, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(before, unmasked.learned.parameters, strict=True))
 
 
 @pytest.mark.slow("trains codes until they know the masks")
@@ -164,7 +164,7 @@ def test_codes_learn_the_masks_and_leave_objects(capsys):
     capsys.readouterr()
     nobody = IlgsTraining(scene, IlgsRefiner(threshold=0.999_999))
     assert not any(len(each) for each in (nobody.finish().objects or {}).values())
-    assert "no hull, for want of Gaussians or as all lie in a plane: class_7, class_40000" in capsys.readouterr().out
+    assert "no hull, since there are too few Gaussians or all lie in a plane: class_7, class_40000" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ def test_dots_of_an_id_come_together_and_get_it(capsys):
     cosines = alike @ alike.T
     assert min(cosines[0, 1], cosines[2, 3]) > 0.95 and cosines[:2, 2:].max() < 0.7
     assert found.class_ids.tolist() == [1, 1, 2, 2] and found.objects is None
-    assert "look like a mask in 2 views or more; they hold 100%" in capsys.readouterr().out
+    assert "resemble a mask in 2 views or more; they hold 100%" in capsys.readouterr().out
     assert all(torch.equal(*pair) for pair in zip(vars(before).values(), vars(scene.surfels()).values(), strict=True))
 
 

@@ -43,7 +43,7 @@ def gradients(training: CodebookTraining, name: str) -> tuple[torch.Tensor | Non
     """Of the codes and of the codebook by one term of a step; the scene has none."""
     terms = training.terms(loss_inputs(training.scene, 2), 2, dict)
     found = torch.autograd.grad(
-        terms[name], [*training.learned.learned, *vars(training.scene.surfels()).values()], allow_unused=True
+        terms[name], [*training.learned.parameters, *vars(training.scene.surfels()).values()], allow_unused=True
     )
     assert all(values is None for values in found[2:]), "means, scales, opacities, .. get nothing at all"
     return found[0], found[1]
@@ -123,12 +123,12 @@ def test_pixels_that_are_not_reliable_teach_no_code(monkeypatch):
 
 def test_a_step_without_mask_leaves_all_as_it_is():
     training = trained(3)
-    before = [values.detach().clone() for values in training.learned.learned]
+    before = [values.detach().clone() for values in training.learned.parameters]
     stepped(training, range(3, 6), masked=False)
     blank = replace(training.scene, labels=[torch.full_like(each, IGNORE) for each in training.scene.labels])
     training.scene = blank
     stepped(training, range(6, 9))
-    assert all(torch.equal(values, old) for values, old in zip(training.learned.learned, before, strict=True))
+    assert all(torch.equal(values, old) for values, old in zip(training.learned.parameters, before, strict=True))
 
 
 def test_unlabelled_pixels_enter_no_term():
@@ -155,7 +155,7 @@ def test_codes_learn_the_masks_and_leave_the_base(capsys):
     base = scene.surfels().clone()
     training = trained(150, scene, hull=False)
     found = training.finish()
-    assert "of them are of one class\n" in capsys.readouterr().out, "every class has a code"
+    assert "of them belong to one class\n" in capsys.readouterr().out, "every class has a code"
     assert all(torch.equal(getattr(scene.surfels(), name), values) for name, values in vars(base).items())
     assert found.objects is not None and sorted(found.objects) == list(FAR_APART[1:])
     by_argmax = CodebookTraining(scene, UnifiedLiftRefiner(rule="argmax"))
@@ -192,7 +192,7 @@ def test_a_restored_run_goes_on_alike():
     again = CodebookTraining(scene, UnifiedLiftRefiner())
     again.restore(first.state())
     stepped(again, range(5, 8))
-    assert all(torch.equal(a, b) for a, b in zip(whole.learned.learned, again.learned.learned, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(whole.learned.parameters, again.learned.parameters, strict=True))
 
 
 def test_two_opaque_dots_in_front_of_a_wall():
