@@ -1,4 +1,4 @@
-"""Write the options into the page: ``python baselines/page.py``. They come from the fields of the refiners' classes."""
+"""Write the table of options into README.md: ``python baselines/page.py``. It comes from the refiners' dataclasses."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def described(kind: type) -> Iterator[tuple[str, str, str]]:
 
 
 def table() -> str:
-    """Return the options of all refiners of this distribution, a row each."""
+    """Return a table of the options of all refiners of this distribution, one a row."""
     rows = ["| refiner | option | default | |", "|---|---|---|---|"]
     points = [point for point in entry_points(group="beags.refiners") if point.value.startswith("beags_baselines.")]
     for point in sorted(points):

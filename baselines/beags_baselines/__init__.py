@@ -1,1 +1,1 @@
-"""Methods of other papers that cut objects out of a scene, as refiners of beags (README.md)."""
+"""Methods of other papers that take objects out of a scene, as refiners of beags (README.md)."""

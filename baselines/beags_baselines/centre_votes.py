@@ -1,13 +1,13 @@
-"""SAGD: Gaussians vote by where their centres fall in the masks, and those at an object's rim are drawn into it.
+"""SAGD: members are chosen by the masks under their centres, and those at an object's rim are moved into it.
 
 Hu et al., "SAGD: Boundary-Enhanced Segment Anything in 3D Gaussian via Gaussian Decomposition", arXiv 2401.17857. A
-Gaussian is a member of an object if its centre lies in the object's mask in more than 0.7 of the views, whatever hides
-it there. A member whose two ends, 1.5 sigma to both sides along its major axis in a picture, lie on different sides of
-the outline is then decomposed: with the share ``ratio`` of the pixels between the ends that the mask has,
+Gaussian is a member of an object if its centre lies in the object's mask in more than 0.7 of the views, occluded or
+not. A member is then decomposed if the outline separates its two ends, 1.5 sigma to both sides along its major axis in
+a picture. With ``ratio`` the share of the pixels between the ends that lie in the mask,
 
     mean += 0.5 (1 - ratio) 3 s_max a,    scales *= 0.8 ratio,
 
-a being its major axis in space, turned towards the end inside. That is the middle of the inner part.
+where a is its major axis in space, towards the end inside. The new mean is the middle of the inner part.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 
 THRESHOLD = 0.7
-"""Share of the votes that a member exceeds."""
+"""Share of votes that a member exceeds."""
 INTERVAL = 20
-"""Views from one in which Gaussians are decomposed to the next."""
+"""Number of views from one decomposition to the next."""
 VOTES = ("seen", "all")
-"""Which views a share is of: those that show the object at all and have the centre in the picture, or all with masks,
-as in the source. The first is the default."""
+"""Views that vote: "seen", the default, those that show the object and have the centre in the picture; "all", as in the
+source, all with masks."""
 
 EXTENT = 3.0  # sigma from end to end
-SHRINK = 0.8
+SHRINK = 0.8  # factor on the scales
 
 
 def members(
@@ -45,42 +45,42 @@ def members(
     threshold: float = THRESHOLD,
     votes: str = VOTES[0],
 ) -> Tensor:
-    """Return [N] int32: the object of which each point is a member, 0 for none; ties of shares go to the lower id.
+    """Return the object of which each point is a member, [N] int32, 0 for none; ties go to the lower id.
 
-    points: [N, 3], centres. labels: per camera [H, W] int class ids below ``num_classes`` or IGNORE. A view in which
-    all is IGNORE has no vote, nor has one that has IGNORE under a centre, about that one. Memory is linear in the
-    (Gaussian, object) pairs that occur; masks are read one at a time.
+    points: [N, 3], centres. labels: per camera [H, W] int class ids below ``num_classes`` or IGNORE. Views without
+    labels do not vote, and a view with IGNORE under a centre does not vote about it. Memory is linear in the number of
+    (Gaussian, object) pairs; masks are read one at a time.
     """
     views = [view for view, mask in enumerate(labels) if bool((mask != IGNORE).any())]
-    found, unlabelled = TorchSparseSums(points.device), torch.zeros(len(points), device=points.device)
+    sums, unlabelled = TorchSparseSums(points.device), torch.zeros(len(points), device=points.device)
     for view in views:
         places, row, column, mask = *pixels_under(points, cameras[view]), labels[view]
         label = mask[row, column].long()
         unlabelled[places[label == IGNORE]] += 1
         keys = (places * num_classes + label)[(label != IGNORE) & (label != BACKGROUND)]
-        found.add(keys, torch.ones_like(keys, dtype=torch.float64))
-    keys, counts = found.found()
+        sums.add(keys, torch.ones_like(keys, dtype=torch.float64))
+    keys, counts = sums.found()
     rows = keys // num_classes
     if votes == "all":
-        asked = len(views) - unlabelled.double()[rows]
+        voters = len(views) - unlabelled.double()[rows]
     else:
-        asked = torch.zeros_like(counts)
-        for view in views:  # again, now that the pairs are known
+        voters = torch.zeros_like(counts)
+        for view in views:  # a second pass: the pairs are known now
             places, row, column, mask = *pixels_under(points, cameras[view]), labels[view]
             voting = torch.zeros(len(points), dtype=torch.bool, device=points.device)
             voting[places] = mask[row, column] != IGNORE
-            shown = torch.zeros(num_classes, dtype=torch.bool, device=points.device)
-            shown[mask[mask != IGNORE].long()] = True
-            asked += voting[rows] & shown[keys % num_classes]
-    class_ids, share, _ = largest_in_rows(keys, counts / asked, len(points), num_classes)
+            visible = torch.zeros(num_classes, dtype=torch.bool, device=points.device)
+            visible[mask[mask != IGNORE].long()] = True
+            voters += voting[rows] & visible[keys % num_classes]
+    class_ids, share, _ = largest_in_rows(keys, counts / voters, len(points), num_classes)
     return class_ids.masked_fill(share <= threshold, BACKGROUND).int()
 
 
 def decompose(surfels: Surfels, class_ids: Tensor, camera: Camera, labels: Tensor) -> tuple[Surfels, Tensor]:
-    """Draw the members that straddle the outline of their object in a view into it; the others keep every bit.
+    """Move and shrink the members that straddle the outline of their object in a view; the others keep every bit.
 
-    surfels: N without gradients. class_ids: [N] int, 0 for no member. labels: [H, W] int class ids or IGNORE, which
-    counts neither as inside nor as outside. Returns the surfels, and the places [M] int64 of those that changed.
+    surfels: N without gradients. class_ids: [N] int, 0 for no member. labels: [H, W] int class ids or IGNORE, which is
+    neither inside nor outside. Returns the surfels, and the indices [M] int64 of those that changed.
     """
     member = class_ids.nonzero()[:, 0]
     seen, row, column = pixels_under(surfels.means[member].double(), camera)
@@ -94,9 +94,9 @@ def decompose(surfels: Surfels, class_ids: Tensor, camera: Camera, labels: Tenso
     ends = torch.stack([center + reach, center - reach], dim=1).nan_to_num().round()
     ends = ends.clamp(min=torch.zeros_like(size), max=size).long()  # [M, 2, (column, row)]
 
-    found = labels[ends[..., 1], ends[..., 0]]
-    inside = found == class_ids[member, None]
-    acts = sound & (inside[:, 0] != inside[:, 1]) & (found != IGNORE).all(dim=1)
+    at_ends = labels[ends[..., 1], ends[..., 0]]
+    inside = at_ends == class_ids[member, None]
+    acts = sound & (inside[:, 0] != inside[:, 1]) & (at_ends != IGNORE).all(dim=1)
     member, ends, reach, axes, logs = member[acts], ends[acts], reach[acts], axes[acts], logs[acts]
     first = inside[acts, 0]
     inner = torch.where(first[:, None], reach, -reach)
@@ -117,12 +117,12 @@ def decompose(surfels: Surfels, class_ids: Tensor, camera: Camera, labels: Tenso
 def _major_axis(u: Tensor, v: Tensor) -> Tensor:
     """Return the major semi-axis [M, 2] of the ellipse that the conjugate semi-axes u, v [M, 2] span.
 
-    It is sqrt(l) d of the larger eigenvalue and its eigenvector of u u^T + v v^T; either sign may come out.
+    It is sqrt(l) d, with the larger eigenvalue l of u u^T + v v^T and its eigenvector d, of either sign.
     """
     a, b, c = u[:, 0] ** 2 + v[:, 0] ** 2, u[:, 0] * u[:, 1] + v[:, 0] * v[:, 1], u[:, 1] ** 2 + v[:, 1] ** 2
     half = (a - c) / 2
     root = (half * half + b * b).sqrt()
-    # of both forms of the eigenvector the one without cancellation; of a circle, whose axes are any, x
+    # The form of the eigenvector without cancellation is used; for a circle the axis is x.
     x = torch.where(half >= 0, half + root, b)
     y = torch.where(half >= 0, b, root - half)
     norm = (x * x + y * y).sqrt()
@@ -131,13 +131,13 @@ def _major_axis(u: Tensor, v: Tensor) -> Tensor:
 
 
 def _share_inside(labels: Tensor, start: Tensor, stop: Tensor, class_ids: Tensor) -> Tensor:
-    """Return [M] float64: of the labelled pixels between two each, both included, the share that has the class.
+    """Return [M] float64: the share of the labelled pixels from start to stop that have the class.
 
-    start, stop: [M, 2] int64, column and row. class_ids: [M].
+    start, stop: [M, 2] int64, column and row, both included. class_ids: [M].
     """
     span = stop - start
     steps = span.abs().amax(dim=1)
-    order = steps.argsort(descending=True, stable=True)  # long ones first, so that those still going come first
+    order = steps.argsort(descending=True, stable=True)  # long lines first: the unfinished ones are then a prefix
     start, span, steps, class_ids = start[order], span[order], steps[order], class_ids[order]
     going = torch.bincount(steps).flip(0).cumsum(0).flip(0).tolist()
     inside = torch.zeros_like(steps)
@@ -145,9 +145,9 @@ def _share_inside(labels: Tensor, start: Tensor, stop: Tensor, class_ids: Tensor
     for step, count in enumerate(going):
         twice = 2 * steps[:count, None].clamp(min=1)
         column, row = (start[:count] + (2 * step * span[:count] + twice // 2) // twice).unbind(dim=1)  # rounded
-        found = labels[row, column]
-        inside[:count] += found == class_ids[:count]
-        labelled[:count] += found != IGNORE
+        label = labels[row, column]
+        inside[:count] += label == class_ids[:count]
+        labelled[:count] += label != IGNORE
     shares = torch.zeros(len(steps), dtype=torch.float64, device=steps.device)
     shares[order] = inside.double() / labelled
     return shares

@@ -1,11 +1,11 @@
-"""COB-GS as a refiner: mask phases (``mask_logits``), which lie between steps, take turns with texture phases.
+"""COB-GS as a refiner: mask phases (``mask_logits``) between steps alternate with texture phases.
 
-Where the port differs from the source: a mask phase is played from sums over each view, which equals drawing it; with
-fewer than 24 views it is longer, as no logit could get far enough; pixels without a label count neither as inside nor
-as outside, and a view without any trains texture alone; halves of a split lie in the plane of their disc; texture
-phases keep the base's loss of normals, and have none of depths, which the source adds where depth maps are given; an
-object that no Gaussian is sure of is empty, where the source falls back to the whole scene. To cut all objects
-in one scene is the way of a fork of the source; the fork's clean-up by voxels, off by default there, is left out.
+Differences from the source: a mask phase is computed from sums over each view, which equals rendering it; with fewer
+than 24 views it is longer, since logits would not move far enough; pixels without a label are neither inside nor
+outside, and a view without labels trains texture only; halves of a split lie in the plane of their disc; texture phases
+keep the base's loss of normals and have none of depths, which the source adds if there are depth maps; an object that
+no Gaussian exceeds the threshold for is empty, where the source falls back to the whole scene. Taking all objects out
+of one scene follows a fork of the source; the fork's clean-up by voxels, off by default there, is left out.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from beags_plugin.system.filed_tensors import filed
 from beags_plugin.system.progress import each_view
 
 RATES = {"features_dc": 2.5e-3, "features_rest": 1.25e-4, "opacities": 0.025, "scales": 0.005, "quats": 0.001}
-POSITION_RATE = 1.6e-6  # times the scene's extent: the last one of the base
+POSITION_RATE = 1.6e-6  # final rate of the base, for a scene of extent 1
 PLAY, SPLIT, LAST_PLAY = range(3)  # purposes of random numbers between two steps
 
 
 @dataclass(frozen=True)
 class CobGsRefiner(Refiner):
-    """Cuts the objects out of one scene in turn, or one object alone; the data decide the number of steps."""
+    """Takes the objects out of one scene in turn, or one object only; the data determine the number of steps."""
 
     object: str = ""
     """The only object, as published; empty: all in turn."""
@@ -55,7 +55,7 @@ class CobGsRefiner(Refiner):
     def __post_init__(self) -> None:
         check_choice(self.order, mask_logits.ORDERS, "order of objects")
         if self.epochs < 6 or self.epochs % 4 != 2:
-            raise UserError(f"epochs is {self.epochs}: give 6, 10, 14, .., so that the last phase is of masks.")
+            raise UserError(f"epochs is {self.epochs}: give 6, 10, 14, .., so that a mask phase is the last.")
         for name in ("tau", "threshold"):
             if not 0.0 <= (value := getattr(self, name)) <= 1.0:
                 raise UserError(f"{name} is {value:g}: give a share, 0 to 1.")
@@ -64,7 +64,7 @@ class CobGsRefiner(Refiner):
 
     @property
     def texture_phases(self) -> int:
-        """Return the number of texture phases of an object; there is one more of masks."""
+        """Return the number of texture phases of an object; mask phases are one more."""
         return self.epochs // (2 * mask_logits.EPOCHS)
 
     def check(self, names: Mapping[int, str]) -> None:
@@ -79,21 +79,21 @@ class CobGsRefiner(Refiner):
 
 
 class CobGsTraining(OwnTraining):
-    """Takes mask phases before the first step of each texture phase and after all steps; texture steps are the base's.
+    """Runs a mask phase before each texture phase and after all steps; texture steps are those of the base.
 
-    With one object Adam goes on from the base. Otherwise each object begins with a new Adam in the scene that the one
-    before left, and takes Gaussians of which it is surer.
+    With one object Adam continues from the base. With several, each object starts with a new Adam in the scene of the
+    previous one, and takes Gaussians for which it has the higher probability.
 
-    logits: of the object whose turn it is. class_ids, scores: [N], what the objects before it took, and how surely.
+    logits: those of the present object. class_ids, scores: [N], the objects taken so far and their probabilities.
     """
 
     def __init__(self, scene: TrainedScene, options: CobGsRefiner) -> None:
         self.scene, self.options = scene, options
         areas, self.masked = {c: 0 for c in scene.names if c != BACKGROUND}, []
         for view, labels in enumerate(scene.labels):
-            held = dict(zip(*(each.tolist() for each in torch.unique(labels, return_counts=True)), strict=True))
-            areas = {c: area + held.get(c, 0) for c, area in areas.items()}
-            if held.keys() - {IGNORE}:
+            counts = dict(zip(*(each.tolist() for each in torch.unique(labels, return_counts=True)), strict=True))
+            areas = {c: area + counts.get(c, 0) for c, area in areas.items()}
+            if counts.keys() - {IGNORE}:
                 self.masked.append(view)
         ordered = mask_logits.object_order(areas, options.order)
         self.objects = [c for c in ordered if options.object in ("", scene.names[c])]
@@ -133,31 +133,32 @@ class CobGsTraining(OwnTraining):
     def restore(self, state: dict[str, Any]) -> None:
         device = self.scores.device
         self.class_ids, self.scores = state["class_ids"].to(device), state["scores"].to(device)
-        # Adam's count of steps stays on the CPU
+        # Adam keeps its count of steps, a scalar, on the CPU.
         moved = {name: values.to(device) if values.dim() else values for name, values in state["logits"].items()}
         self.logits.restore(moved)
 
     def _begin(self, surfels: Surfels) -> None:
-        """Take new logits, of the next object."""
+        """Start new logits for the next object."""
         self.logits = mask_logits.MaskLogits(torch.zeros_like(surfels.opacity_logits))
 
     def _last_phase(self, edited: Densified, class_id: int, step: int) -> Densified:
-        """Remove what is mixed after an object's last mask phase, and let the object take its Gaussians."""
+        """Remove mixed Gaussians after an object's last mask phase, and let the object take its Gaussians."""
         agreement = self._learn(edited.surfels, class_id, self.scene.generator(step, LAST_PLAY))
-        left = Densified.unchanged(edited.surfels).only(~mask_logits.mixed(agreement, self.options.tau))
-        edited = self._followed(edited, left)
-        surest = (self.class_ids, self.scores, self.logits.logits, class_id, self.options.threshold)
-        self.class_ids, self.scores = mask_logits.claim(*surest)
+        pure = Densified.unchanged(edited.surfels).only(~mask_logits.mixed(agreement, self.options.tau))
+        edited = self._followed(edited, pure)
+        self.class_ids, self.scores = mask_logits.claim(
+            self.class_ids, self.scores, self.logits.logits, class_id, self.options.threshold
+        )
         return edited
 
     def _followed(self, edited: Densified, then: Densified) -> Densified:
-        """Return both edits as one; logits, ids and scores follow the second."""
+        """Return both edits as one; logits, ids and scores follow the second one."""
         self.logits.follow(then.source, then.fresh)
         self.class_ids, self.scores = self.class_ids[then.source], self.scores[then.source]
         return edited.then(then)
 
     def _learn(self, surfels: Surfels, class_id: int, generator: torch.Generator) -> Tensor:
-        """Take the steps of a mask phase; return how far each Gaussian's pixels agree, [N]."""
+        """Take the steps of a mask phase; return the agreement of each Gaussian's pixels, [N]."""
         scene, inputs, count = self.scene, geometry_inputs(surfels), len(self.masked)
         cameras = [scene.cameras[view] for view in self.masked]
 
@@ -167,13 +168,13 @@ class CobGsTraining(OwnTraining):
 
         def sums(place: int) -> Tensor:
             table = scene.rasterizer.class_contributions(inputs, cameras[place], scene.settings, mask(place), 2)
-            return table.T.flip(0)  # inside first
+            return table.T.flip(0)  # rows: inside, outside
 
         def counts(place: int) -> Tensor:
             rasterizer = optional_products(scene.rasterizer)
-            found = rasterizer.sparse_class_pixel_counts(inputs, cameras[place], scene.settings, mask(place), 2)
+            keys, numbers = rasterizer.sparse_class_pixel_counts(inputs, cameras[place], scene.settings, mask(place), 2)
             table = inputs.means.new_zeros(2 * len(surfels))
-            table[found[0]] = found[1].to(table)
+            table[keys] = numbers.to(table)
             return table.view(-1, 2).T.flip(0)
 
         with torch.no_grad(), scene.stage(f"Learning {scene.names[class_id]}") as progress:

@@ -1,4 +1,4 @@
-"""FlashSplat: a Gaussian joins each object that holds more of its blending weight than a threshold; nothing is trained.
+"""FlashSplat: a Gaussian joins each object with more than a threshold of its blending weight; nothing is trained.
 
 Shen, Yang, Wang, "FlashSplat: 2D to 3D Gaussian Splatting Segmentation Solved Optimally", ECCV 2024. A mask rendered
 from one label per Gaussian is linear in the labels, so that each label has a closed form. With f the sum of a
@@ -7,13 +7,13 @@ Gaussian's weights over the labelled pixels of the object, and r that over all o
     member  iff  f / n > r / n + gamma,  n = sqrt(f^2 + r^2),
             iff  s > s*(gamma) = (1 + gamma / sqrt(2 - gamma^2)) / 2,  s = f / (f + r).
 
-Objects are cut out one by one against the rest: with gamma >= 0 a Gaussian joins at most one and perhaps none, with
-gamma < 0 perhaps several.
+Objects are taken out one by one against the rest: with gamma >= 0 a Gaussian joins one object or none, with gamma < 0
+possibly several.
 
-Where the port differs: sums are of float64 and in a fixed order, where the source adds float32 in any; the second line
-above replaces the first, which the source computes; all views vote, as in its scripts (its code takes ten unless told
-otherwise); pixels without a label, which it does not know, enter no sum; gamma is by default that of one of its
-scripts, not 0 as in its code. It draws no masks of objects: they are drawn here as those of all refiners.
+Differences from the source: sums are float64 and in a fixed order, where the source adds float32 in any order; the
+second line above replaces the first, which the source computes; all views vote, as in its scripts (its code takes ten
+by default); pixels without a label, which the source does not have, enter no sum; gamma is by default that of one of
+its scripts, not 0 as in its code. The source renders no masks of objects: here they are rendered as with all refiners.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from beags_plugin.preparation.refiner import AssignedScene, Refiner
 from beags_plugin.system.errors import UserError
 
 GAMMA = 0.4
-"""Bias towards the rest, -1..1: above 0 it drops Gaussians that the object shares with other things, below 0 it keeps
-more of them. The source's code has 0; its scripts choose 0.4 to 0.75 scene by scene, and less than 0 for removal."""
+"""Bias towards the rest, -1..1: above 0 it drops Gaussians that the object shares with others, below 0 it keeps more of
+them. The source's code has 0; its scripts use 0.4 to 0.75 by scene, and less than 0 for removal."""
 
 
 def threshold(gamma: float = GAMMA) -> float:
-    """Return s*(gamma), the share of the weight above which a Gaussian is a member; raise ``UserError`` beyond 1."""
+    """Return s*(gamma), the share of weight that a member exceeds; raises ``UserError`` for gamma outside -1..1."""
     if not -1.0 <= gamma <= 1.0:
         raise UserError(f"gamma is {gamma:g}, but FlashSplat's bias lies in -1..1: 0 takes the larger side.")
     return (1.0 + gamma / math.sqrt(2.0 - gamma * gamma)) / 2.0
@@ -51,13 +51,13 @@ def members(sums: Tensor, totals: Tensor, gamma: float = GAMMA) -> Tensor:
 
 @dataclass(frozen=True)
 class FlashSplatRefiner(Refiner):
-    """Cuts every object out of the base against the rest; nothing is trained."""
+    """Takes every object out of the base against the rest; nothing is trained."""
 
     gamma: float = GAMMA
     """Bias, -1 to 1: below 0 objects keep more."""
 
     def __post_init__(self) -> None:
-        threshold(self.gamma)  # raises
+        threshold(self.gamma)  # raises for invalid values
 
     def members(self, scene: AssignedScene) -> Membership:
         total = scene.contributions.total()

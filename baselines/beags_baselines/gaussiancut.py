@@ -1,9 +1,9 @@
 """GaussianCut as a refiner: a minimum cut of the Gaussians' graph for each object (``graph_cut``).
 
-Where the port differs from the source: the masks are those of the data in all training views, so that clicks, scribbles
-and the tracking of masks over the views are left out; they are not resized here, bilinearly with all above 0 as in the
-source (files of another size than the photos were read by the nearest pixel); pixels without a label, which the source
-does not know, enter no share. Of several objects each is cut out against all else. For the cut see ``graph_cut``.
+Differences from the source: the masks are those of the data in all training views, so that clicks, scribbles and the
+tracking of masks over the views are left out; masks are not resized here, which the source does bilinearly, taking all
+values above 0; pixels without a label, which the source does not have, enter no share. Each of several objects is cut
+out against all else. For the cut see ``graph_cut``.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from beags_plugin.system.errors import UserError
 
 @dataclass(frozen=True)
 class GaussianCutRefiner(Refiner):
-    """Cuts every object out of the base against the rest; nothing is trained, objects may overlap."""
+    """Cuts every object out of the base against the rest; nothing is trained, and objects may overlap."""
 
     num_edges: int = graph_cut.NUM_EDGES
     """Nearest neighbours of a Gaussian in the graph."""
     foreground_threshold: float = graph_cut.FOREGROUND_THRESHOLD
-    """Share that makes an example of the object; without any it is empty."""
+    """Share that makes an example of the object; without examples it is empty."""
 
     def __post_init__(self) -> None:
         if self.num_edges < 1:

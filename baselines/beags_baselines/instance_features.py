@@ -1,14 +1,14 @@
-"""OpenGaussian: features of Gaussians that agree within the masks of a view, and codebooks of them.
+"""OpenGaussian: features of Gaussians that are trained to agree within masks, and codebooks of them.
 
 Wu et al., "OpenGaussian: Towards Point-Level 3D Gaussian-based Open Vocabulary Understanding", NeurIPS 2024. A feature
-f_i [6] is drawn as phi(f) = (f / |f| + 1) / 2, F(u) = sum_i w_i phi(f_i), with A(u) = sum_i w_i. In a view with the
-masks P_1 .. P_n, the background's among them, and the means mu_m of F over the pixels of P_m where A > 0.7,
+f_i [6] is rendered as phi(f) = (f / |f| + 1) / 2, F(u) = sum_i w_i phi(f_i), with A(u) = sum_i w_i. In a view with
+masks P_1 .. P_n, including the background's, and the means mu_m of F over the pixels of P_m where A > 0.7,
 
     cohesion    = mean over m of the mean over P_m of |F(u) - mu_m|,
     separation  = sum over a != b of w_ab / (1 + |mu_a - mu_b|^2) / (n (n - 1)),   w_ab = 0.1 + 0.9 rank / (n - 1),
 
-rank being the place of b among the others of a, the nearest last. Codebooks are k-means of f and positions, then of f
-within a cluster. A Gaussian drawn with the feature q of its centre leaves the gradient by q to f.
+where rank is the place of b among the others of a, the nearest last. Codebooks are k-means of f and positions, then of
+f within a cluster. If a Gaussian is rendered with the feature q of its centre, f gets the gradient by q.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from beags_plugin.losses.reduction import grouped_sums, ordered_sum
 
 CHANNELS = 6
 SOLID = 0.7  # alpha above which a pixel shows something
-LEAST_WEIGHT = 0.1  # of a pair of masks
+LEAST_WEIGHT = 0.1  # least weight of a pair of masks
 LLOYD_STEPS = 5
-MAX_VARIANCE = 0.006  # of drawn features within a mask whose mean can be trusted
-LARGE_AREA = 0.8  # of the largest mask of the view: such masks are trusted whatever their variance
-MATCH_SCORE = 0.2  # that a mask must exceed to name a leaf
+MAX_VARIANCE = 0.006  # largest variance of rendered features within a mask that is kept
+LARGE_AREA = 0.8  # share of the view's largest mask above which a mask is kept with any variance
+MATCH_SCORE = 0.2  # score that a mask must exceed to give a leaf its class
 
 
 def drawn_form(features: Tensor) -> Tensor:
-    """Return phi(f) [N, 6] in 0..1; that of 0 is 1/2."""
+    """Return phi(f) [N, 6] in 0..1; phi(0) is 1/2."""
     return (features / _length(features) + 1.0) / 2.0
 
 
 def _length(rows: Tensor) -> Tensor:
-    """Return [.., 1], whose gradient at 0 is 0."""
+    """Return the norms [.., 1] of rows, with a gradient of 0 at 0."""
     return rows.square().sum(dim=-1, keepdim=True).clamp_min(1e-24).sqrt()
 
 
 @dataclass(frozen=True)
 class MaskedPixels:
-    """The masks of one view, of P pixels: n of them, one for each class that it shows.
+    """The n masks of one view of P pixels, one for each class in it.
 
-    classes: [n] int64, ranks, ascending. places: [P] int64, of each pixel the mask, or n where there is none.
+    classes: [n] int64, ranks, ascending. places: [P] int64, the index of each pixel's mask, or n without a mask.
     areas: [n] int64.
     """
 
@@ -55,7 +55,7 @@ class MaskedPixels:
 
     @classmethod
     def of(cls, ranks: Tensor) -> MaskedPixels:
-        """Return those of a map [H, W] int of ranks, or IGNORE, which is no mask."""
+        """Return the masks of a map [H, W] int of ranks or IGNORE, which is no mask."""
         flat = ranks.reshape(-1).long()
         flat = flat.masked_fill(flat == IGNORE, -1) + 1
         counts = torch.bincount(flat, minlength=1)[1:]
@@ -69,19 +69,19 @@ class MaskedPixels:
 
     @property
     def labelled(self) -> Tensor:
-        """Return [P] bool."""
+        """Return [P] bool: the pixels with a mask."""
         return self.places < len(self)
 
     def sums(self, rows: Tensor) -> Tensor:
-        """Return [n, C], the sums over each mask of values [P, C]; differentiable."""
+        """Return the sums of values [P, C] over each mask, [n, C]; differentiable."""
         return grouped_sums(rows, self.places, len(self) + 1)[:-1]
 
     def spread(self, values: Tensor) -> Tensor:
-        """Return [P, C], of each pixel the value [n, C] of its mask, 0 where there is none; differentiable."""
+        """Return for each pixel the value [n, C] of its mask, [P, C], 0 without a mask; differentiable."""
         return embedding(self.places, pad(values, (0, 0, 0, 1)))
 
     def means(self, rows: Tensor, chosen: Tensor | None = None) -> Tensor:
-        """Return [n, C], the mean over each mask of values [P, C], where ``chosen`` [P] bool; 0 of no pixel."""
+        """Return the means of values [P, C] over the ``chosen`` [P] bool pixels of each mask, [n, C]; 0 without any."""
         if chosen is None:
             return self.sums(rows) / self.areas[:, None]
         weights = chosen.to(rows.dtype)[:, None]
@@ -96,7 +96,7 @@ def cohesion(drawn: Tensor, means: Tensor, masks: MaskedPixels) -> Tensor:
 
 
 def separation(means: Tensor, late: bool = False) -> Tensor:
-    """Return how near the means [n, C] of different masks are, 0 of a single one.
+    """Return how near the means [n, C] of different masks are; 0 for a single mask.
 
     late: in the second half of the training weights below 0.9 become 0.1.
     """
@@ -114,10 +114,10 @@ def separation(means: Tensor, late: bool = False) -> Tensor:
 
 @dataclass(frozen=True)
 class PseudoMasks:
-    """The masks of all views as pseudo labels: M of them.
+    """The M masks of all views as pseudo labels.
 
-    views, classes: [M] int64, the classes as ranks. means: [M, 6], of drawn features. kept: [M] bool, whether these
-    agree within the mask, or it is large.
+    views, classes: [M] int64, classes as ranks. means: [M, 6], mean rendered features. kept: [M] bool, whether the
+    features agree within the mask, or the mask is large.
     """
 
     views: Tensor
@@ -127,13 +127,13 @@ class PseudoMasks:
 
     @classmethod
     def none(cls, like: Tensor) -> PseudoMasks:
-        """Return those of no view; like: features."""
+        """Return an empty set; like: features."""
         nothing = torch.zeros(0, dtype=torch.int64, device=like.device)
         return cls(nothing, nothing, like.new_zeros(0, CHANNELS), nothing.bool())
 
     @classmethod
     def of_view(cls, view: int, drawn: Tensor, masks: MaskedPixels) -> PseudoMasks:
-        """Return those of one view; drawn: [P, 6], F."""
+        """Return the masks of one view; drawn: [P, 6], F."""
         means = masks.means(drawn)
         variance = masks.means((drawn - masks.spread(means)).square()).mean(dim=1)
         large = masks.areas > LARGE_AREA * masks.areas.max() if len(masks) else masks.areas > 0
@@ -141,11 +141,11 @@ class PseudoMasks:
 
     @classmethod
     def joined(cls, parts: list[PseudoMasks]) -> PseudoMasks:
-        """Return those of all views."""
+        """Return all parts as one."""
         return cls(*(torch.cat(values) for values in zip(*(vars(part).values() for part in parts), strict=True)))
 
     def of(self, view: int) -> PseudoMasks:
-        """Return those of one view, in the order of ``MaskedPixels``."""
+        """Return the masks of one view, in the order of ``MaskedPixels``."""
         own = self.views == view
         return PseudoMasks(*(values[own] for values in vars(self).values()))
 
@@ -158,9 +158,10 @@ def label_loss(
     squared: bool = False,
     exclude_dropped: bool = False,
 ) -> Tensor:
-    """Return the mean over labelled solid pixels of |F - G|_1, G being the mean of the pixel's mask, or 0 if dropped.
+    """Return the mean of |F - G|_1 over labelled solid pixels; G is the mean of the pixel's mask, or 0 if not kept.
 
-    drawn: [P, 6]. alpha: [P]. squared: of |F - G|^2 instead. exclude_dropped: pixels of dropped masks do not count.
+    drawn: [P, 6]. alpha: [P]. squared: |F - G|^2 instead. exclude_dropped: pixels of masks that are not kept do not
+    count.
     """
     difference = drawn - masks.spread(labels.means * labels.kept[:, None])
     distances = (difference.square() if squared else difference.abs()).sum(dim=1)
@@ -174,8 +175,8 @@ def label_loss(
 class Codebook:
     """Clusters and leaves; leaf j * fine + l is the l-th of cluster j.
 
-    coarse: [k1, 9] centres. clusters: [N] int64. fine: [k1, k2, 6] centres. leaves: [N] int64, k1 * k2 before a
-    Gaussian's cluster had its turn. used: [k1] int64, leaves of each. occurs: [V, k1] bool, where a cluster shows.
+    coarse: [k1, 9] centres. clusters: [N] int64. fine: [k1, k2, 6] centres. leaves: [N] int64, k1 * k2 until a
+    Gaussian's cluster is divided. used: [k1] int64, number of leaves. occurs: [V, k1] bool, views that show a cluster.
     """
 
     coarse: Tensor
@@ -187,17 +188,17 @@ class Codebook:
 
 
 def straight_through(features: Tensor, centres: Tensor) -> Tensor:
-    """Return the centres [N, 6] of features [N, 6], which get the gradient by them as it is."""
+    """Return centres [N, 6], whose gradient goes unchanged to features [N, 6]."""
     return centres.detach() + (features - features.detach())
 
 
 def _finite(vectors: Tensor) -> Tensor:
-    """Return vectors whose NaN and infinite numbers, those of broken Gaussians, count as 0."""
+    """Return vectors with 0 in place of NaN and infinite numbers, which broken Gaussians have."""
     return torch.nan_to_num(vectors, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def nearest_centres(vectors: Tensor, centres: Tensor) -> Tensor:
-    """Return [N] int64, of each vector [N, D] the nearest of centres [k, D]."""
+    """Return the index of the centre [k, D] nearest to each vector [N, D], [N] int64."""
     from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
 
     cloud = _finite(vectors.detach().cpu().double()).numpy()
@@ -206,10 +207,10 @@ def nearest_centres(vectors: Tensor, centres: Tensor) -> Tensor:
 
 
 def lloyd(vectors: Tensor, centres: Tensor, steps: int = LLOYD_STEPS) -> tuple[Tensor, Tensor]:
-    """Return centres [k, D] after steps of k-means from ``centres``, and the nearest of each vector, [N] int64.
+    """Return centres [k, D] after steps of k-means from ``centres``, and the nearest to each vector, [N] int64.
 
-    A centre that no vector is nearest to becomes 0, as in the source. scikit-learn's k-means would move it elsewhere,
-    and adds up in an order that depends on the threads.
+    A centre without vectors becomes 0, as in the source. scikit-learn's k-means would move it, and its sums depend on
+    the number of threads.
     """
     vectors = _finite(vectors)
     for _ in range(steps):
@@ -220,16 +221,16 @@ def lloyd(vectors: Tensor, centres: Tensor, steps: int = LLOYD_STEPS) -> tuple[T
 
 
 def first_centres(vectors: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Return [count, D], vectors [N, D] drawn without replacement, and zeros where there are fewer."""
+    """Return [count, D]: random vectors [N, D] without replacement, and zeros if there are fewer."""
     chosen = torch.randperm(len(vectors), generator=generator)[:count].to(vectors.device)
     return pad(_finite(vectors[chosen]), (0, 0, 0, count - len(chosen)))
 
 
 def fine_clusters(drawn: Tensor, silhouette: Tensor, masks: MaskedPixels, labels: PseudoMasks, most: int = 10) -> int:
-    """Return how many pseudo masks of a view a cluster, drawn alone, shows: see ``opengaussian``.
+    """Return the number of a view's pseudo masks that a cluster, rendered alone, shows: see ``opengaussian``.
 
-    drawn: [P, 6]. silhouette: [P] bool. Masks count that it covers by more than a fifth and whose means are like its
-    own over the common pixels.
+    drawn: [P, 6]. silhouette: [P] bool. A mask counts if the silhouette covers more than a fifth of it and both have
+    similar means over the common pixels.
     """
     covered = masks.sums(silhouette.to(drawn.dtype)[:, None])[:, 0] / masks.areas
     difference = masks.means(drawn, silhouette) - labels.means
@@ -238,9 +239,9 @@ def fine_clusters(drawn: Tensor, silhouette: Tensor, masks: MaskedPixels, labels
 
 
 def matched_mask(drawn: Tensor, silhouette: Tensor, masks: MaskedPixels, labels: PseudoMasks) -> int | None:
-    """Return the place of the pseudo mask that a leaf, drawn alone, shows best, or None.
+    """Return the index of the pseudo mask that best matches a leaf rendered alone, or None.
 
-    The score is IoU (1 - |mean F over the silhouette - mean of the mask|_1), over labelled pixels. drawn: [P, 6].
+    The score is IoU x (1 - |mean F over the silhouette - mean of the mask|_1), over labelled pixels. drawn: [P, 6].
     silhouette: [P] bool.
     """
     silhouette = silhouette & masks.labelled
@@ -256,17 +257,17 @@ def matched_mask(drawn: Tensor, silhouette: Tensor, masks: MaskedPixels, labels:
 
 
 def inliers(points: Tensor, factor: float = 1.0) -> Tensor:
-    """Return [n] bool: the mean squared distance from the nearest K = floor(sqrt(n)) is not far above the others'.
+    """Return [n] bool: points whose mean squared distance to the nearest K = floor(sqrt(n)) is not far above others'.
 
-    points: [n, 3]. Bound: mean plus ``factor`` times the standard deviation of all these distances. A point is the
-    nearest of itself.
+    points: [n, 3]. The bound is the mean plus ``factor`` standard deviations of all these distances. A point is the
+    nearest to itself.
     """
     from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
 
     if len(points) < 2:
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
     cloud = _finite(points.detach().cpu().double()).numpy()
-    wanted = list(range(1, int(len(cloud) ** 0.5) + 1))
-    squares = cKDTree(cloud).query(cloud, k=wanted, workers=torch.get_num_threads())[0] ** 2
+    ranks = list(range(1, int(len(cloud) ** 0.5) + 1))
+    squares = cKDTree(cloud).query(cloud, k=ranks, workers=torch.get_num_threads())[0] ** 2
     inside = squares.mean(axis=1) <= squares.mean() + factor * squares.std()
     return torch.from_numpy(inside).to(points.device)

@@ -1,14 +1,14 @@
-"""The mask phase of COB-GS: a learnt mask logit per Gaussian, and which Gaussians lie across an object's boundary.
+"""The mask phase of COB-GS: a trained mask logit per Gaussian, and Gaussians that lie across an object's boundary.
 
 Zhang, Jiang, Chen, Jiang, Liu: "COB-GS: Clear Object Boundaries in 3DGS Segmentation Based on Boundary-Adaptive
-Gaussian Splitting", CVPR 2025. With w_i(u) the blending weights and G_v the object's mask in view v, a step draws
+Gaussian Splitting", CVPR 2025. With w_i(u) the blending weights and G_v the object's mask in view v, a step renders
 M(u) = sum_i sigmoid(m_i) w_i(u) with all but m frozen, and takes the linear loss sum_u (-G + lambda (1 - G)) M / (H W):
 
     dL/dm_i = sigmoid(m_i) (1 - sigmoid(m_i)) (lambda W_out[i, v] - W_in[i, v]) / (H_v W_v)
     r[i, v] = |n_in - n_out| / (n_in + n_out + 1e-6), 1 where both are 0;  rbar_i = mean over views
 
 W are the sums of w_i over the pixels inside and outside of the mask, n the numbers of these pixels. No Gaussian moves
-within a phase, so W and n are constants of it: one pass over the views replaces all the phase's drawings.
+within a phase, so W and n are constant: one pass over the views replaces all renderings of the phase.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from beags_plugin.system.errors import check_choice
 RATE = 0.1
 BETAS = (0.9, 0.999)
 EPS = 1e-15
-EPOCHS = 2  # of a phase
+EPOCHS = 2  # epochs of a phase
 FEW_STEPS = 48  # two epochs of 24 views: from m = 0, sigmoid(m) > 0.9 needs 24 steps in one direction
 OUTSIDE_WEIGHT = 1.0  # lambda
-TAU = 0.8  # of captures all around; 0.5 of forward-facing ones
-SPLIT_SCALE = 0.01  # of the scene's extent: smaller Gaussians are not split
+TAU = 0.8  # value for captures all around; 0.5 for forward-facing ones
+SPLIT_SCALE = 0.01  # share of the scene's extent below which Gaussians are not split
 THRESHOLD = 0.9
 ORDERS = ("area_desc", "area_asc", "label_asc")
 
@@ -40,7 +40,7 @@ State = dict[str, Tensor]
 class MaskLogits:
     """The logits m of one object, with their own Adam.
 
-    logits: [N] float, to start from; the source starts from 0.
+    logits: [N] float, initial values; 0 in the source.
     """
 
     def __init__(self, logits: Tensor, rate: float = RATE) -> None:
@@ -70,16 +70,12 @@ class MaskLogits:
 
         self._hold(moved(self.logits), {name: moved(values) for name, values in self._moments().items()})
 
-    def members(self, threshold: float = THRESHOLD) -> Tensor:
-        """Return [N] bool, the object: sigmoid(m) above ``threshold``; a Gaussian that no view shows is not in it."""
-        return sigmoid(self.logits) > threshold
-
     def state(self) -> State:
         """Return copies of the logits and, after the first step, of Adam's state."""
         return {name: values.clone() for name, values in {"logits": self.logits, **self._moments()}.items()}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Take up what ``state`` returned; the number of Gaussians may differ."""
+        """Continue from a former ``state()``; the number of Gaussians may differ."""
         moments = {name: values.clone() for name, values in state.items() if name != "logits"}
         self._hold(state["logits"], moments)
 
@@ -88,9 +84,9 @@ class MaskLogits:
 
 
 def phase_epochs(views: int) -> int:
-    """Return the epochs of a mask phase over ``views`` views with masks: 2, or more where there are below 24.
+    """Return the epochs of a mask phase over ``views`` views with masks: 2, or more for fewer than 24 views.
 
-    The specification lengthens "a phase" and gives a reason that concerns the logits alone: texture phases stay at 2.
+    The reason, the reach of the logits, does not concern texture phases, which stay at 2.
     """
     return max(EPOCHS, math.ceil(FEW_STEPS / max(views, 1)))
 
@@ -103,12 +99,12 @@ def play_phase(
     epochs: int = EPOCHS,
     outside_weight: float = OUTSIDE_WEIGHT,
 ) -> None:
-    """Take the steps of a phase: every view once in each epoch, in random order, but for the phase's last step.
+    """Take the steps of a phase: every view once in each epoch, in random order, without the last step of the phase.
 
-    In the source, the edit at the end of a phase replaces the parameters before that step, which so never happens.
+    In the source that step has no effect, because the edit at the end of a phase replaces the parameters before it.
 
-    sums: for a view's place, (W_in, W_out) [N] each or [2, N]; asked once a step, as they may lie in files.
-    pixels: per view with a mask, H_v W_v. generator: on the CPU.
+    sums: returns (W_in, W_out) of a view by index, [N] each or [2, N]; called once a step, as they may lie in files.
+    pixels: H_v W_v of each view with a mask. generator: on the CPU.
     """
     for view in shuffled(len(pixels), epochs, generator)[:-1]:
         inside, outside = sums(view)
@@ -116,14 +112,14 @@ def play_phase(
 
 
 def shuffled(views: int, epochs: int, generator: torch.Generator) -> list[int]:
-    """Return the views' places in the order of ``epochs`` epochs, each without replacement."""
+    """Return the indices of views in a random order for each of ``epochs`` epochs."""
     return [view for _ in range(epochs) for view in torch.randperm(views, generator=generator).tolist()]
 
 
 def mean_agreement(counts: Iterable[Any]) -> Tensor:
-    """Return rbar [N] float64: how far all pixels of a Gaussian agree about the object, view by view.
+    """Return rbar [N] float64, the mean agreement of a Gaussian's pixels about the object.
 
-    counts: per view with a mask, (n_in, n_out) [N] each or [2, N], numbers of pixels; at least one view.
+    counts: (n_in, n_out) of each view with a mask, [N] each or [2, N], numbers of pixels; at least one view.
     """
     total, views = torch.zeros(()), 0
     for inside, outside in counts:
@@ -134,17 +130,17 @@ def mean_agreement(counts: Iterable[Any]) -> Tensor:
 
 
 def to_split(agreement: Tensor, log_scales: Tensor, extent: float, tau: float = TAU) -> Tensor:
-    """Return [N] bool: what a phase splits at its end, unless it is the last one. log_scales: [N, 2]."""
+    """Return [N] bool: Gaussians that a phase, except the last one, splits at its end. log_scales: [N, 2]."""
     return mixed(agreement, tau) & (log_scales.amax(dim=-1).exp() > SPLIT_SCALE * extent)
 
 
 def mixed(agreement: Tensor, tau: float = TAU) -> Tensor:
-    """Return [N] bool: what the last phase removes, whatever its size."""
+    """Return [N] bool: Gaussians of any size that the last phase removes."""
     return agreement < tau
 
 
 def object_order(areas: Mapping[int, int], order: str = ORDERS[0]) -> list[int]:
-    """Return the objects in the order in which one scene takes them; areas: of all masks of each, in pixels."""
+    """Return the objects in the order in which they are trained; areas: pixels of all masks of each object."""
     check_choice(order, ORDERS, "order of objects")
     sign = {"area_desc": -1, "area_asc": 1, "label_asc": 0}[order]
     return sorted(areas, key=lambda class_id: (sign * areas[class_id], class_id))
@@ -153,9 +149,9 @@ def object_order(areas: Mapping[int, int], order: str = ORDERS[0]) -> list[int]:
 def claim(
     class_ids: Tensor, scores: Tensor, logits: Tensor, class_id: int, threshold: float = THRESHOLD
 ) -> tuple[Tensor, Tensor]:
-    """Return ids and scores [N] after an object of one scene: it takes what it is surer of than those before it.
+    """Return ids and scores [N] after an object: it takes Gaussians for which it has the highest probability so far.
 
-    class_ids [N] int32 and scores [N] start at 0; children of a split have their parent's.
+    class_ids [N] int32 and scores [N] start at 0; children of a split inherit their parent's.
     """
     p = sigmoid(logits)
     won = (p > threshold) & (p > scores)

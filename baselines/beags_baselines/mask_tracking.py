@@ -1,16 +1,16 @@
-"""InstaScene's tracking: which Gaussians a mask is made of, which masks hold several objects, and seeds of objects.
+"""InstaScene's tracking: the Gaussians behind each mask, masks that hold several objects, and seeds of objects.
 
 Yang et al., "InstaScene: Towards Complete 3D Instance Decomposition and Reconstruction from Cluttered Scenes",
 ICCV 2025. Gaussian i is traced in view v, to class c, iff w_i > 0.1 at a pixel there, of class c. Only labelled pixels
-count, the background being a class. A mask (v, c) of an object is made of the set Q of Gaussians traced to it, if there
-are at least 50. In another view v' each of Q has the class, among those of objects, to which it is traced with most
-pixels, or 0. The mask shows in v' unless more than 0.7 of Q have 0; it is contained there if more than 0.8 of the
-others have one class, else split. It is under-segmented if it shows nowhere, or is split in more than 0.3 of the views
-where it shows. With F_c the views with other masks of c,
+count; the background is a class. A mask (v, c) of an object is tracked if at least 50 Gaussians, the set Q, are traced
+to it. In another view v' each of Q has the object class to which it is traced with most pixels, or 0. The mask shows in
+v' unless more than 0.7 of Q have 0; it is contained there if more than 0.8 of the others have one class, else split. It
+is under-segmented if it shows in no view, or is split in more than 0.3 of the views that show it. With F_c the views
+with other masks of c,
 
     seeds of c = { i:  sum over F_c of [i traced to c in v]  >  0.5 sum over F_c of [i traced in v] },
 
-if F_c has two views. An under-segmented mask of which more than 0.8 are seeds of one class is taken back.
+if F_c has two views. An under-segmented mask is accepted again if more than 0.8 of its set are seeds of one class.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from torch import Tensor
 MIN_WEIGHT = 0.1
 MIN_GAUSSIANS = 50
 HIDDEN, CONTAINED, SPLIT, SEEDED, TAKEN_BACK = 0.7, 0.8, 0.3, 0.5, 0.8
-LEAST_VIEWS = 2  # of F_c
+LEAST_VIEWS = 2  # views that F_c needs
 
 
 @dataclass(frozen=True)
 class TracedView:
     """The Gaussians that are traced in one view.
 
-    traced: [T] int32, ascending. members, classes, counts: [M] int32, traced to a class, ranks from 0 (background),
-    with so many pixels; ascending by Gaussian, then class.
+    traced: [T] int32, ascending. members, classes, counts: [M] int32: the Gaussian, the class to which it is traced, a
+    rank from 0 (background), and the number of pixels; ascending by Gaussian, then class.
     """
 
     traced: Tensor
@@ -42,42 +42,42 @@ class TracedView:
 
     @classmethod
     def of_counts(cls, keys: Tensor, counts: Tensor, num_classes: int) -> TracedView:
-        """Make it of pixel counts, keys i * num_classes + c, ascending."""
+        """Return the view of pixel counts with keys i * num_classes + c, ascending."""
         rows, columns = keys // num_classes, keys % num_classes
         return cls(torch.unique_consecutive(rows).int(), rows.int(), columns.int(), counts.int())
 
     def strongest(self, count: int, ground: bool = False) -> Tensor:
-        """Return [count] int64: of each Gaussian the object to which it is traced with most pixels, 0 without any.
+        """Return [count] int64: the object to which each Gaussian is traced with most pixels, 0 without any.
 
-        Ties go to the lower class. ground: whether the background takes part, as an object of its own.
+        Ties go to the lower class. ground: whether the background counts as an object.
         """
         own = torch.ones_like(self.classes, dtype=torch.bool) if ground else self.classes > 0
         members, classes, counts = self.members[own].long(), self.classes[own].long(), self.counts[own]
         most = counts.new_zeros(count).scatter_reduce(0, members, counts, "amax")
         leads = counts == most[members]
         beyond = int(classes.max()) + 2 if len(classes) else 1
-        found = classes.new_full((count,), beyond)
-        found = found.scatter_reduce(0, members[leads], classes[leads] + int(ground), "amin")
-        return found.masked_fill(found == beyond, 0)
+        lowest = classes.new_full((count,), beyond)
+        lowest = lowest.scatter_reduce(0, members[leads], classes[leads] + int(ground), "amin")
+        return lowest.masked_fill(lowest == beyond, 0)
 
 
 @dataclass(frozen=True)
 class TrackedMasks:
-    """What tracking says.
+    """Results of tracking.
 
-    seeds: of each class, by rank, its seeds [S] int64, ascending; none of the background. suspect: (view, rank) of the
-    masks that are under-segmented.
+    seeds: by rank, the seeds [S] int64 of each class, ascending; none for the background. suspect: (view, rank) of
+    under-segmented masks.
     """
 
     seeds: tuple[Tensor, ...]
     suspect: frozenset[tuple[int, int]]
 
     def seed_classes(self, count: int) -> Tensor:
-        """Return [count] int64, of each Gaussian the lowest class that has it as a seed, else 0."""
-        found = torch.zeros(count, dtype=torch.int64, device=self.seeds[0].device)
+        """Return [count] int64: the lowest class of which each Gaussian is a seed, else 0."""
+        classes = torch.zeros(count, dtype=torch.int64, device=self.seeds[0].device)
         for rank in reversed(range(1, len(self.seeds))):
-            found[self.seeds[rank]] = rank
-        return found
+            classes[self.seeds[rank]] = rank
+        return classes
 
     def filtered(self, view: int, ranks: Tensor) -> Tensor:
         """Return the map of a view with its under-segmented masks set to the background."""
@@ -97,14 +97,14 @@ def tracked_masks(
 ) -> TrackedMasks:
     """Track the masks of all views through all views.
 
-    count: of Gaussians. num_classes: ranks, the background's included. ground_votes: whether Gaussians on the
-    background count as of an object of its own, as the source's masks of the ground would have them.
+    count: number of Gaussians. num_classes: number of ranks, including the background. ground_votes: whether the
+    background counts as an object, as the ground does in the source's masks.
     """
     masks, sets = _masks(views, min_gaussians)
     split, shown = _splits(views, sets, count, ground_votes, progress)
     under = (shown == 0) | (split > SPLIT * shown)
-    kept = [mask for mask, bad in zip(masks, under.tolist(), strict=True) if not bad]
-    seeds = _seeds(views, kept, count, num_classes)
+    accepted = [mask for mask, bad in zip(masks, under.tolist(), strict=True) if not bad]
+    seeds = _seeds(views, accepted, count, num_classes)
     suspect = under.nonzero()[:, 0].tolist()
     best = torch.zeros(len(masks), dtype=torch.int64)
     for each in seeds[1:]:
@@ -113,12 +113,12 @@ def tracked_masks(
             is_seed[each] = True
             for place in suspect:
                 best[place] = max(int(best[place]), int(is_seed[sets[place].long()].sum()))
-    left = [masks[place] for place in suspect if not int(best[place]) > TAKEN_BACK * len(sets[place])]
-    return TrackedMasks(seeds, frozenset(left))
+    rejected = [masks[place] for place in suspect if not int(best[place]) > TAKEN_BACK * len(sets[place])]
+    return TrackedMasks(seeds, frozenset(rejected))
 
 
 def _masks(views: list[TracedView], min_gaussians: int) -> tuple[list[tuple[int, int]], list[Tensor]]:
-    """Return (view, rank) of the masks of objects that are tracked, and of each its Gaussians, Q."""
+    """Return (view, rank) of the tracked masks of objects, and the Gaussians Q of each."""
     masks, sets = [], []
     for view, found in enumerate(views):
         for rank in torch.unique(found.classes).tolist():
@@ -132,7 +132,7 @@ def _masks(views: list[TracedView], min_gaussians: int) -> tuple[list[tuple[int,
 def _splits(
     views: list[TracedView], sets: list[Tensor], count: int, ground: bool, progress: Callable[[int, int], None] | None
 ) -> tuple[Tensor, Tensor]:
-    """Return of each mask the number of views in which it is split, and of those in which it shows, [masks] int64."""
+    """Return for each mask the numbers of views in which it is split and in which it shows, [masks] int64."""
     if not sets:
         return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
     device = sets[0].device
@@ -156,12 +156,12 @@ def _splits(
 
 
 def _seeds(
-    views: list[TracedView], kept: Iterable[tuple[int, int]], count: int, num_classes: int
+    views: list[TracedView], masks: Iterable[tuple[int, int]], count: int, num_classes: int
 ) -> tuple[Tensor, ...]:
-    """Return the seeds of each class, by the views of its masks that are not under-segmented."""
+    """Return the seeds of each class by the views of ``masks``, which are not under-segmented."""
     device = views[0].traced.device
     own_views: list[list[int]] = [[] for _ in range(num_classes)]
-    for view, rank in kept:
+    for view, rank in masks:
         own_views[rank].append(view)
     seeds = []
     for rank, those in enumerate(own_views):

@@ -1,17 +1,16 @@
-"""Unified-Lift: codes that draw together by object, and a codebook of object vectors that learns to tell them apart.
+"""Unified-Lift: codes that are contrasted by object, and a codebook of object vectors that classifies them.
 
 Zhu et al., "Rethinking End-to-End 2D to 3D Scene Segmentation in Gaussian Splatting" (Unified-Lift), CVPR 2025. With F
-[P, 16] the drawn codes of a view's labelled pixels, x = F / (|F| + 1e-6), its norm held constant, and u_a the mean of x
-over the n_a pixels of id a, S_a the sum of their distances |x - u_a|:
+[P, 16] the rendered codes of a view's labelled pixels, x = F / (|F| + 1e-6), whose norm has no gradient, u_a the mean
+of x over the n_a pixels of id a, and S_a the sum of their distances |x - u_a|:
 
     L_con = mean over ids a of  sum over x of a of  -ln(e^{x.u_a / f_a} / (sum_b e^{x.u_b / f_b} + 1e-6)),
     f_a = clip(10 S_a / (n_a ln(n_a + 10)), 0.5, 1),
     L_reg = mean over all pixels of (|F| - 1)^2.
 
-Both reach the codes alone. The codebook B [256, 16] sees F without gradient: a Hungarian matching gives each id a of
-the view a code pi(a), by the sum over its pixels of softmax(B F), so that large masks choose first; and over the pixels
-R that are reliable, where the share of the own id in the sum of e^{x.u_b / f_b}, f_b = clip(0.1 S_b / .., 0.1, 1), is
-above 0.2,
+Both have gradients to the codes only. For the codebook B [256, 16] F has no gradient. A Hungarian matching gives each
+id a of the view a code pi(a) by the sum of softmax(B F) over its pixels, so that large masks choose first. The reliable
+pixels R are those whose own id has a share above 0.2 in the sum of e^{x.u_b / f_b}, f_b = clip(0.1 S_b / .., 0.1, 1):
 
     L_cls = mean over R of CE(B F, pi(M)) / ln 256,  if any pixel of the view gets another code than it should,
     L_conc = mean over R of |x - B_pi(M)|.
@@ -30,31 +29,31 @@ from beags_baselines.identity_codes import NORMALISER, THRESHOLD, Classify, prob
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.losses.reduction import grouped_sums, ordered_linear, ordered_mean, ordered_outer_sum, ordered_sum
 
-SAMPLES = 32_768  # pixels of L_con, drawn with replacement
-LEAST_PIXELS = 20  # of them that an id must exceed
+SAMPLES = 32_768  # random pixels of L_con, with replacement
+LEAST_PIXELS = 20  # samples that an id must exceed
 WEIGHTS = {"contrast": 1e-6, "norms": 1e-6, "classes": 1e-4, "concentration": 1.0}
-RELIABLE = 0.2  # share of the own prototype above which a pixel counts
+RELIABLE = 0.2  # share of the own id above which a pixel is reliable
 OWNED = 0.7  # share of a code's pixels above which it belongs to a class
 RULES = ("softmax", "argmax")
-"""When a Gaussian is of an object: softmax(B f) is above the threshold for one of the object's codes, or its largest
-code is the object's. The first is the default."""
+"""Rules by which a Gaussian belongs to an object: softmax(B f) is above the threshold for one of the object's codes
+(default), or its largest code is the object's."""
 CODES = 256
 
-AT_ONCE = 2**22  # logits, or other numbers of pixels, that are held at a time: 16 MB
+AT_ONCE = 2**22  # logits, or other values of pixels, in memory at a time: 16 MB
 
 
 def sampled(count: int, generator: torch.Generator) -> Tensor:
-    """Return ``SAMPLES`` of the numbers below ``count``, drawn with replacement, [S] int64, on the CPU."""
+    """Return ``SAMPLES`` random indices below ``count``, with replacement, [S] int64, on the CPU."""
     return torch.randint(count, (SAMPLES,), generator=generator)
 
 
 def directions(drawn: Tensor) -> Tensor:
-    """Return x [P, C] of F [P, C]; the gradient takes the norm for a constant."""
+    """Return x [P, C] of F [P, C]; the norm has no gradient."""
     return drawn / (drawn.detach().norm(dim=1, keepdim=True) + 1e-6)
 
 
 def contrast(drawn: Tensor, ids: Tensor) -> Tensor:
-    """Return L_con of sampled pixels; 0, with a gradient of 0, where no id has enough of them.
+    """Return L_con of sampled pixels; 0, with a gradient of 0, if no id has enough of them.
 
     drawn: [S, C], F. ids: [S] int64, of any values.
     """
@@ -63,7 +62,7 @@ def contrast(drawn: Tensor, ids: Tensor) -> Tensor:
     enough = counts > LEAST_PIXELS
     if (many := int(enough.sum())) == 0:
         return 0.0 * ordered_sum(drawn)
-    group = torch.where(enough, enough.cumsum(0) - 1, many)[group]  # the others are one last group, which goes
+    group = torch.where(enough, enough.cumsum(0) - 1, many)[group]  # the other ids form a last group, which is dropped
     means, temperatures = _prototypes(x, group, many + 1, 10.0, 0.5)
     means, temperatures = means[:many], temperatures[:many]
     scores = ordered_linear(x, means / temperatures[:, None], x.new_zeros(many))
@@ -73,13 +72,13 @@ def contrast(drawn: Tensor, ids: Tensor) -> Tensor:
 
 
 def norms(drawn: Tensor, labelled: Tensor) -> Tensor:
-    """Return L_reg over the labelled pixels, of which there is one. drawn: [P, C]. labelled: [P] bool."""
+    """Return L_reg over the labelled pixels, at least one. drawn: [P, C]. labelled: [P] bool."""
     return ordered_sum(torch.where(labelled, (drawn.norm(dim=1) - 1.0) ** 2, 0.0)) / labelled.sum()
 
 
 @torch.no_grad()
 def reliable(drawn: Tensor, group: Tensor, count: int) -> Tensor:
-    """Return R, [P] bool. drawn: [P, C], F. group: [P] int64 below ``count``, the ids of the view, numbered."""
+    """Return R, [P] bool. drawn: [P, C], F. group: [P] int64 below ``count``, the numbered ids of the view."""
     return own_shares(drawn, group, count) > RELIABLE
 
 
@@ -90,8 +89,8 @@ def own_shares(drawn: Tensor, group: Tensor, count: int) -> Tensor:
     weight, nothing = means / temperatures[:, None], x.new_zeros(count)
     shares = torch.empty_like(x[:, 0])
     for rows in _chunks(len(x), count):
-        found = ordered_linear(x[rows], weight, nothing).exp()
-        shares[rows] = found.gather(1, group[rows, None])[:, 0] / found.sum(dim=1)
+        similar = ordered_linear(x[rows], weight, nothing).exp()
+        shares[rows] = similar.gather(1, group[rows, None])[:, 0] / similar.sum(dim=1)
     return shares
 
 
@@ -122,22 +121,22 @@ def code_masses(classify: Classify, drawn: Tensor, group: Tensor, count: int, co
 
 
 def largest_codes(classify: Classify, rows: Tensor, codes: int) -> Tensor:
-    """Return the largest of that many codes for each row [P, C], [P] int64."""
+    """Return the code of largest logit for each row [P, C], [P] int64; codes: their number."""
     return torch.cat([classify(rows[part]).argmax(dim=1) for part in _chunks(len(rows), codes)])
 
 
 def matching(masses: Tensor) -> Tensor:
-    """Return pi [n] int64, the code of each id, no two the same: the matching of largest mass. masses: [n, codes]."""
+    """Return pi [n] int64, a different code for each id: the matching of largest mass. masses: [n, codes]."""
     from scipy.optimize import linear_sum_assignment
 
     return torch.from_numpy(linear_sum_assignment(masses.double().cpu().numpy(), maximize=True)[1]).to(masses.device)
 
 
 def code_entropy(classify: Classify, drawn: Tensor, labels: Tensor, outputs: int) -> Tensor:
-    """Return the cross-entropy of each pixel, [P]; the logits of some pixels are held at a time, see ``AT_ONCE``.
+    """Return the cross-entropy of each pixel, [P]; memory holds the logits of some pixels at a time, see ``AT_ONCE``.
 
-    drawn: [P, C]; gradients reach it and the classifier. labels: [P] int below ``outputs``, or IGNORE as the pixels
-    that get 0.
+    drawn: [P, C]; it and the classifier get gradients. labels: [P] int below ``outputs``, or IGNORE, where the result
+    is 0.
     """
 
     def part(rows: slice) -> Tensor:
@@ -150,20 +149,20 @@ def code_entropy(classify: Classify, drawn: Tensor, labels: Tensor, outputs: int
 
 
 def selection(classify: Classify, drawn: Tensor, targets: Tensor, outputs: int) -> Tensor:
-    """Return L_cls of the pixels of R, of which there is one. drawn: [R, C], F. targets: [R] int64, pi(M)."""
+    """Return L_cls of the pixels of R, at least one. drawn: [R, C], F. targets: [R] int64, pi(M)."""
     return ordered_mean(code_entropy(classify, drawn, targets, outputs)) / math.log(NORMALISER)
 
 
 def concentration(codebook: Tensor, drawn: Tensor, targets: Tensor) -> Tensor:
-    """Return L_conc of the pixels of R; 0 of none. drawn: [R, C], F without gradient. targets: [R], pi(M)."""
+    """Return L_conc of the pixels of R; 0 without any. drawn: [R, C], F without gradient. targets: [R], pi(M)."""
     return ordered_mean((directions(drawn) - embedding(targets, codebook)).norm(dim=1))
 
 
 def owners(tables: Tensor) -> Tensor:
-    """Return the class of each code, [codes] int64, -1 of nobody's.
+    """Return the class of each code, [codes] int64, -1 for none.
 
-    tables: [K, codes] int64, over all views the labelled pixels of a class that get a code. A code belongs to the class
-    of more than ``OWNED`` of its pixels.
+    tables: [K, codes] int64, labelled pixels of each class that get a code, over all views. A code belongs to a class
+    that has more than ``OWNED`` of its pixels.
     """
     most, owner = tables.max(dim=0)
     return torch.where(most.double() > OWNED * tables.sum(dim=0).double(), owner, -1)
@@ -173,26 +172,26 @@ def owners(tables: Tensor) -> Tensor:
 def members_by_softmax(
     classify: Classify, codes: Tensor, owner: Tensor, num_classes: int, threshold: float = THRESHOLD
 ) -> dict[int, Tensor]:
-    """Return rank to [N] bool of the objects: softmax(B f) is above the threshold for a code of the object.
+    """Return rank to [N] bool for the objects: softmax(B f) is above the threshold for a code of the object.
 
     codes: [N, C], f. owner: [codes] int64 ranks, or -1. Rank 0 is the background, which is no object.
     """
-    found = {rank: torch.zeros(len(codes), dtype=torch.bool, device=codes.device) for rank in range(1, num_classes)}
+    objects = {rank: torch.zeros(len(codes), dtype=torch.bool, device=codes.device) for rank in range(1, num_classes)}
     for rows in _chunks(len(codes), len(owner)):
         at, code = (probabilities(classify, codes[rows]) > threshold).nonzero().unbind(dim=1)
         of = owner[code]
         for rank in torch.unique(of[of > 0]).tolist():
-            found[rank][rows.start + at[of == rank]] = True
-    return found
+            objects[rank][rows.start + at[of == rank]] = True
+    return objects
 
 
 @torch.no_grad()
 def ranks_by_argmax(classify: Classify, codes: Tensor, owner: Tensor) -> Tensor:
-    """Return [N] int64: the rank of the class that has a Gaussian's largest code, 0 where nobody has it."""
+    """Return [N] int64: the rank of the class of each Gaussian's largest code, 0 if it belongs to none."""
     return owner[largest_codes(classify, codes, len(owner))].clamp(min=0)
 
 
 def _chunks(rows: int, width: int) -> list[slice]:
-    """Return slices of rows, each of about ``AT_ONCE`` numbers if a row has ``width``; one at least."""
+    """Return slices of rows of ``width`` numbers, each slice with about ``AT_ONCE`` numbers; at least one slice."""
     size = max(AT_ONCE // max(width, 1), 1)
     return [slice(first, min(first + size, rows)) for first in range(0, max(rows, 1), size)]

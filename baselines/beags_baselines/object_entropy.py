@@ -1,12 +1,12 @@
 """The object loss of ObjectGS: cross-entropy of blended one-hot ids against the mask.
 
 Zhu, Yu, Xu, Jiang, Li, Zhang, Pang, Dai: "ObjectGS: Object-aware Scene Reconstruction and Scene Understanding via
-Gaussian Splatting", ICCV 2025. With p(u) = sum_i w_i onehot(phi_i), on no background:
+Gaussian Splatting", ICCV 2025. With p(u) = sum_i w_i onehot(phi_i), without background:
 
     L = mean over counted pixels of -p_M(u) + log sum_c exp(p_c)
 
-p itself is the logit: it is no probability (its sum is alpha, at most 1), and L is never 0, so that right pixels are
-pulled towards alpha = 1 for ever. All K channels belong to the sum, also those of classes that the view does not show.
+p itself is the logit and no probability (its sum is alpha, at most 1). L is never 0, so that right pixels are always
+pulled towards alpha = 1. The sum includes all K channels, also of classes that the view does not show.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from torch import Tensor
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.losses.reduction import ordered_sum
 
-WEIGHT = 0.1  # of L; its releases for single data sets have 0.1, 0.01 and 0.001
-SCALE_WEIGHT = 0.01  # of ``mean_area``
+WEIGHT = 0.1  # weight of L; the releases for single data sets have 0.1, 0.01 and 0.001
+SCALE_WEIGHT = 0.01  # weight of ``mean_area``
 IGNORE_BACKGROUND = False
 
 
 def counted_labels(
     labels: Tensor, carried: Tensor | None = None, ignore_background: bool = IGNORE_BACKGROUND
 ) -> Tensor:
-    """Return labels [H, W] int of a view, IGNORE at the pixels that do not count.
+    """Return the labels [H, W] int of a view with IGNORE at pixels that do not count.
 
-    carried: [K] bool, the classes that some Gaussian has; pixels of others do not count.
-    ignore_background: leave out 0, which is one more object otherwise; the source leaves out its 0, "unlabelled".
+    carried: [K] bool, classes of which there are Gaussians; pixels of others do not count.
+    ignore_background: leave out 0, which is an object otherwise; the source leaves out its 0, "unlabelled".
     """
     left_out = labels == BACKGROUND if ignore_background else torch.zeros_like(labels, dtype=torch.bool)
     if carried is not None:
@@ -37,7 +37,7 @@ def counted_labels(
 
 
 def label_entropy(logits: Tensor, labels: Tensor | None) -> Tensor:
-    """Return the mean cross-entropy over labelled pixels; 0, without gradient, where there are none.
+    """Return the mean cross-entropy over labelled pixels; 0, without gradient, if there are none.
 
     logits: [H, W, K] float. labels: [H, W] int below K, or IGNORE; None for a view without mask.
     """

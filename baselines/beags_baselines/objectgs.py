@@ -1,18 +1,18 @@
 """ObjectGS as a refiner, on surfels: fixed classes, and a cross-entropy of their blend (``object_entropy``).
 
 The source trains anchors and their networks from scratch, with the classes of seed points. Here the Gaussians of a
-trained base get theirs (``object_labels``), and train on in the same number at the refinement's rates, as those of the
-base's start would tear it up; or, ``joint``, a base grows with the classes of its seed points.
+trained base get classes (``object_labels``) and are trained in the same number at the refinement's rates, since the
+rates of the base's start would destroy it. With ``joint`` a base grows with the classes of its seed points.
 
-What is lost without anchors: opacity, shape and colour that networks make for each view, so that a leak may be hidden
-in some of them; the bound on how far a Gaussian lies from its anchor, of whose class it is; networks that all objects
-share; growth and pruning of the Gaussians of an anchor together, to the end. A ``joint`` base grows as any other, and
-new Gaussians have the class of the one they come from, where the source's new anchors have the highest id of several.
+Without anchors these properties are lost: opacity, shape and colour from networks for each view, so that a leak may be
+hidden in some views; the bound on a Gaussian's distance from its anchor, which gives its class; networks that all
+objects share; joint growth and pruning of the Gaussians of an anchor. A ``joint`` base grows like any other, and new
+Gaussians inherit their class, where the source's new anchors have the highest id of several.
 
-Where the port differs besides: classes are those of blending weights in all views, or of projected centres, where the
-source has seed points vote, by their tracks unless told otherwise; what it leaves out as its id 0, "unlabelled", is
-IGNORE here, and the background is one more object; the term of sizes is of areas, there of volumes; the weight of the
-cross-entropy is the same for all data, there chosen by data set.
+Other differences from the source: classes come from blending weights in all views, or from projected centres, where in
+the source seed points vote, by default by their tracks; pixels with the source's id 0, "unlabelled", are IGNORE here,
+and the background is one more object; the term of sizes is of areas, there of volumes; the weight of the cross-entropy
+is the same for all data, there it is chosen by data set.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from beags_plugin.system.errors import UserError, check_choice
 
 @dataclass(frozen=True)
 class ObjectGsRefiner(Refiner):
-    """Trains all parameters of the scene by its photos and its classes, which stay as they are."""
+    """Trains all parameters of the scene on its photos and its classes; the classes stay fixed."""
 
     weight: float = object_entropy.WEIGHT
     """Weight of the cross-entropy."""
@@ -73,8 +73,8 @@ class ObjectGsRefiner(Refiner):
             labels = labels_by_majority(scene.surfels.means, scene.cameras, scene.labels, scene.num_classes)
             return Membership(labels)
         if self.labels == "nonzero":
-            found, ranks = scene.contributions, scene.contributions.classes
-            labels = labels_by_weight(found.keys, found.sums, found.count, found.columns, nonzero=True)
+            table, ranks = scene.contributions, scene.contributions.classes
+            labels = labels_by_weight(table.keys, table.sums, table.count, table.columns, nonzero=True)
             return Membership(labels if ranks is None else ranks.class_ids(labels))
         return None
 
@@ -83,11 +83,10 @@ class ObjectGsRefiner(Refiner):
 
 
 class LabelledTraining(OwnTraining):
-    """Trains the scene with the classes that its Gaussians have, which a checkpoint holds: no state of its own."""
+    """Trains the scene with the classes of its Gaussians; checkpoints hold these, so it has no state of its own."""
 
     def __init__(self, scene: TrainedScene, options: ObjectGsRefiner) -> None:
-        self.scene = scene
-        self.options = options
+        self.scene, self.options = scene, options
         self.ranks = ClassRanks(torch.tensor(list(scene.names), device=scene.class_ids().device))
 
     def terms(self, inputs: LossInputs, step: int, base: Callable[[], Terms]) -> Terms:
@@ -103,7 +102,7 @@ class LabelledTraining(OwnTraining):
             blend = rasterizer.class_channels(ranked, inputs.camera, scene.settings, len(self.ranks))
             terms["classes"] = options.weight * object_entropy.label_entropy(blend, labels)
         if options.scale_weight > 0:
-            logs = inputs.surfels.log_scales - math.log(scene.scale)  # in units of the input poses, as published
+            logs = inputs.surfels.log_scales - math.log(scene.scale)  # published in units of the input poses
             terms["areas"] = options.scale_weight * object_entropy.mean_area(logs, inputs.render.visible)
         return terms
 

@@ -17,12 +17,12 @@ from beags_plugin.preparation.refiner_training import Edit, OwnTraining, Terms, 
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.progress import say
 
-OFF = -1
+OFF = -1  # interval without decomposition
 
 
 @dataclass(frozen=True)
 class SagdRefiner(Refiner):
-    """Cuts the objects out of the base by votes, and moves and shrinks Gaussians at their rims; trains nothing."""
+    """Takes objects out of the base by votes, and moves and shrinks Gaussians at their rims; nothing is trained."""
 
     threshold: float = centre_votes.THRESHOLD
     """Share of the votes that a member exceeds."""
@@ -39,15 +39,15 @@ class SagdRefiner(Refiner):
             raise UserError(f"gd_interval is {self.gd_interval}: give a number of views, 1 or more, or -1 for none.")
 
     def members(self, scene: AssignedScene) -> Membership:
-        asked = (scene.surfels.means, scene.cameras, scene.labels, scene.num_classes)
-        return Membership(centre_votes.members(*asked, self.threshold, self.votes))
+        views = (scene.surfels.means, scene.cameras, scene.labels, scene.num_classes)
+        return Membership(centre_votes.members(*views, self.threshold, self.votes))
 
     def own_training(self, scene: TrainedScene) -> OwnTraining:
         return Decomposition(scene, self)
 
 
 class Decomposition(OwnTraining):
-    """Trains nothing, and decomposes in the end; the members are those of the votes before."""
+    """Decomposes Gaussians at the end and trains nothing; the members are those of the votes."""
 
     def __init__(self, scene: TrainedScene, options: SagdRefiner) -> None:
         self.scene, self.options = scene, options

@@ -1,10 +1,10 @@
-"""Trace3D as a refiner: the photos train on while Gaussians that straddle objects go (``instance_tracing``).
+"""Trace3D as a refiner: Gaussians that straddle objects are removed during further training (``instance_tracing``).
 
-Where the port differs from the source: masks have ids that agree between views, so that merging them, the contrastive
-features that make them agree, and the query by a mask in one view are left out; counts are exact (its kernel adds
-without atomics and loses some), of labelled pixels alone, as it knows no others; the loss is the base's at that step
-(the source's has its term of normals from the first); with another number of steps than 9,000 the cycles move along,
-at the same rates; if all Gaussians would go, the most opaque one stays.
+Differences from the source: masks have ids that agree between views, so that merging of masks, the contrastive features
+that make them agree, and the query by a mask in one view are left out; counts are exact (the source's kernel adds
+without atomics and loses some) and of labelled pixels only; the loss is the base's at that step (the source's has its
+term of normals from the first step); with another number of steps than 9,000 the cycles scale, at the same rates; if
+all Gaussians would be removed, the most opaque one stays.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ RATES = {"features_dc": 2.5e-3, "features_rest": 1.25e-4, "opacities": 0.05, "sc
 
 @dataclass(frozen=True)
 class Trace3DRefiner(Refiner):
-    """Trains with the base's losses for the steps that are asked for; classes in the end are exclusive."""
+    """Trains with the base's losses; each Gaussian has at most one class at the end."""
 
     weights: str = WEIGHTS[0]
-    """What a pixel counts: count, 1; alpha, its blending weight."""
+    """Weight of a pixel: count, 1; alpha, the blending weight."""
     position_lr: str = tracing.POSITION_RATE
     """Rate of the centres: released (0) or intended."""
     min_pixels: int = tracing.MIN_PIXELS
@@ -67,7 +67,7 @@ class Trace3DRefiner(Refiner):
 
 
 class TraceTraining(OwnTraining):
-    """Holds no state: the step says what happens. A step before an edit trains nothing, as in the source."""
+    """Has no state: the step determines the edits. A step before an edit trains nothing, as in the source."""
 
     def __init__(self, scene: TrainedScene, options: Trace3DRefiner) -> None:
         self.scene, self.options = scene, options
@@ -99,7 +99,7 @@ class TraceTraining(OwnTraining):
         return Edit(self._composited(Densified.unchanged(self.scene.surfels().detach())))
 
     def finish(self) -> Membership:
-        """Return the classes; more than half of the pixels are of the largest class, if of any."""
+        """Return the classes; a member has more than half of its pixels in its class."""
         scene, surfels = self.scene, self.scene.surfels().detach()
         views = (surfels, scene.cameras, scene.labels, scene.rasterizer, scene.settings, self.num_classes)
         with scene.stage("Taking the objects") as progress:
@@ -108,14 +108,14 @@ class TraceTraining(OwnTraining):
         return Membership(class_ids.int().masked_fill(~inside, 0))
 
     def _product(self) -> Product:
-        """Return what is summed of a view: numbers of pixels, or their weights."""
+        """Return the sums of a view that count: numbers of pixels or weights."""
         rasterizer = self.scene.rasterizer
         if self.counts:
             return optional_products(rasterizer).sparse_class_pixel_counts
         return rasterizer.sparse_class_contributions
 
     def _ambiguous(self, surfels: Surfels) -> Tensor:
-        """Trace all views; return which Gaussians are ambiguous, [N] bool."""
+        """Trace all views and return the ambiguous Gaussians, [N] bool."""
         scene, options, inputs = self.scene, self.options, geometry_inputs(surfels)
         product = self._product()
         traced = tracing.InstanceTracing(len(surfels), surfels.means.device)
@@ -129,7 +129,7 @@ class TraceTraining(OwnTraining):
         return traced.ambiguous(options.max_ambiguous)
 
     def _composited(self, edited: Densified) -> Densified:
-        """Prune what no view composites at any pixel, labelled or not."""
+        """Prune Gaussians that no view composites at any pixel, labelled or not."""
         scene, inputs = self.scene, geometry_inputs(edited.surfels)
         rasterizer = optional_products(scene.rasterizer)
 

@@ -164,7 +164,7 @@ def test_codes_learn_the_masks_and_leave_objects(capsys):
     capsys.readouterr()
     nobody = IlgsTraining(scene, IlgsRefiner(threshold=0.999_999))
     assert not any(len(each) for each in (nobody.finish().objects or {}).values())
-    assert "no hull, since there are too few Gaussians or all lie in a plane: class_7, class_40000" in capsys.readouterr().out
+    assert "too few Gaussians or all lie in a plane: class_7, class_40000" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
