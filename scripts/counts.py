@@ -1,4 +1,4 @@
-"""Count what the house is made of: ``python scripts/counts.py [--options]``."""
+"""Count lines of code, words of pages and options: ``python scripts/counts.py [--options]``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def lines(folder: str, *suffixes: str) -> int:
 
 
 def table() -> Iterator[tuple[str, int]]:
-    """Yield what is counted, and how much of it there is."""
+    """Yield each quantity and its count."""
     yield "lines of Python in beags_plugin/", lines("beags_plugin", ".py")
     yield "lines of Python in baselines/", lines("baselines", ".py")
     yield "lines of Python and TOML in benchmarks/", lines("benchmarks", ".py", ".toml")
@@ -34,7 +34,7 @@ def table() -> Iterator[tuple[str, int]]:
 
 
 def options() -> list[str]:
-    """Return the options of ``ns-train beags`` that nerfstudio does not have, as they are typed."""
+    """Return the options of ``ns-train beags`` that nerfstudio does not have, as typed."""
     from beags_plugin.plugin.options.config import base_config
 
     config: Any = base_config()
@@ -52,7 +52,7 @@ def _own(prefix: str, config: Any) -> Iterator[str]:
 
 
 def _hidden(field: dataclasses.Field) -> bool:
-    return "Suppress" in str(field.type)  # a key that presets may set, and the command line does not have
+    return "Suppress" in str(field.type)  # presets may set such a key, the command line may not
 
 
 def _leaves(name: str, value: Any) -> Iterator[str]:

@@ -1,8 +1,8 @@
 """Write the sources of the documentation site: ``python scripts/docs_site.py [FOLDER]`` (build/docs/pages).
 
-They are README.md, CONTRIBUTING.md, CHANGELOG.md, baselines/README.md and docs/*.md with the files that they show, the
-notebook as a page, and a page of reference for each extension point: its interface and what is built in. zensical.toml
-builds a site of them (``make docs``).
+The sources are README.md, CONTRIBUTING.md, CHANGELOG.md, baselines/README.md and docs/*.md with the files that they
+show, the notebook as a page, and a reference page for each extension point with its interface and built-in entries.
+zensical.toml builds the site from them (``make docs``).
 Links to other files of the repository become links to its public address, ``Repository`` under ``[project.urls]`` of
 pyproject.toml; without one they become the file's path.
 """
@@ -35,7 +35,7 @@ LINK = re.compile(r"(?P<before>!?\[(?P<text>[^\]]*)\]\()(?P<goal>[^)\s#]+)(?P<an
 SOURCE = re.compile(r'(?P<before>src=")(?P<goal>[^"#]+)(?P<after>")')
 
 PACKAGES = (ROOT / "beags_plugin", ROOT / "benchmarks" / "beags_benchmarks")
-INTERFACES = {  # by entry-point group
+INTERFACES = {  # entry-point group to module
     "beags.rasterizers": "beags_plugin.rasterizers.interface",
     "beags.losses": "beags_plugin.losses.base",
     "beags.refiners": "beags_plugin.preparation.refiner",
@@ -50,7 +50,7 @@ INTERFACES = {  # by entry-point group
 
 @dataclass(frozen=True)
 class Extensions:
-    """A registry as its source has it. kind: the user's word. builtin: "module:attribute" by name."""
+    """A registry in source code. kind: the user's word. builtin: name to "module:attribute"."""
 
     kind: str
     group: str
@@ -85,15 +85,15 @@ def reference(extensions: Extensions) -> str:
 
 
 def rewritten(text: str, document: Path, repository: str, shown: set[Path]) -> str:
-    """Return a document's text with links that hold in the site; adds the files that it shows to ``shown``.
+    """Return a document's text with links that work in the site; adds the files that it shows to ``shown``.
 
-    document: its file, below ROOT. repository: the public address, or "". Links to what is not there stay as they are:
-    the build of the site refuses them.
+    document: its file, below ROOT. repository: the public address, or "". Broken links stay, so that the build of the
+    site reports them.
     """
     docs = ROOT / "docs"
 
     def place(goal: str) -> str | Path | None:
-        """Return where a file lies in the site, the file itself where it lies outside, None for what is no file."""
+        """Return a file's path in the site, the file itself if it is not in the site, None for other goals."""
         file = (document.parent / goal).resolve()
         if re.match(r"[a-z]+:", goal) or not file.exists() or not file.is_relative_to(ROOT):
             return None

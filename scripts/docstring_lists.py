@@ -1,4 +1,4 @@
-"""An extension of griffe: lists the attributes and parameters that a docstring describes as ``name: ...``."""
+"""An extension of griffe that makes lists of attributes and parameters that a docstring describes as ``name: ...``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import griffe
 
 
 class DocstringLists(griffe.Extension):
-    """Make a list item of each description in a docstring; only names of the object's own begin one."""
+    """Makes a list item of each description in a docstring; only the object's own names begin one."""
 
     def on_class(self, *, cls: griffe.Class, **kwargs: Any) -> None:
         self._list(cls, set(cls.members))

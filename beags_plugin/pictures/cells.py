@@ -23,7 +23,7 @@ Square = tuple[int, int, int]
 
 
 def square_around(shown: np.ndarray) -> Square:
-    """Return the square around the True pixels of ``shown`` [H, W] bool with a margin; the whole image if there are none."""
+    """Return the square around the True pixels of ``shown`` [H, W] bool with a margin; else the whole image."""
     height, width = shown.shape
     if not shown.any():
         return 0, 0, max(height, width)

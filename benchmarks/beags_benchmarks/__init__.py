@@ -1,1 +1,1 @@
-"""Measurements of beags: experiments (``beags bench``), and studies, a program each."""
+"""Measurements of beags: experiments (``beags bench``), and studies, each a program of its own."""

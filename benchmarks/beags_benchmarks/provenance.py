@@ -1,4 +1,4 @@
-"""The machine, command and commit of a measurement, which every published figure has to name."""
+"""The machine, command and commit of a measurement, which every published number must name."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def describe_machine() -> dict[str, str | int]:
     """Return the CPU's name, the cores that this process may use, the memory in MB and the system."""
     try:
         cores = len(os.sched_getaffinity(0))
-    except AttributeError:  # not on macOS
+    except AttributeError:  # macOS has no such call
         cores = os.cpu_count() or 1
     try:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") >> 20
@@ -29,7 +29,7 @@ def describe_machine() -> dict[str, str | int]:
 
 
 def busy_note(cores: int) -> str | None:
-    """Return a sentence if other programs were at work in the last minute, else None."""
+    """Return a sentence if other programs were busy in the last minute, else None."""
     try:
         load = os.getloadavg()[0]
     except (AttributeError, OSError):
@@ -43,7 +43,7 @@ def _cpu_name() -> str:
     try:
         with open("/proc/cpuinfo") as lines:
             names = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
-        # x86 has a name; ARM, often, only numbers
+        # ARM often has numbers only.
         family = " ".join(names[key] for key in ("cpu family", "model") if key in names)
         if "model name" in names:
             return f"{names['model name']} (family/model {family.replace(' ', '/')})" if family else names["model name"]
@@ -53,14 +53,14 @@ def _cpu_name() -> str:
 
 
 def with_these_packages(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment of a program that is to import these very packages."""
+    """Return the environment of a program that imports the same packages."""
     places = [str(Path(file).resolve().parents[1]) for file in (__file__, beags_plugin.__file__)]
     paths = os.pathsep.join(filter(None, [*places, environment.get("PYTHONPATH")]))
     return {**environment, "PYTHONPATH": paths}
 
 
 def command() -> str:
-    """Return the command line of this process: of ``beags``, or of another package's module that ``python -m`` runs."""
+    """Return the command line of this process, ``beags`` or ``python -m`` of another package's module."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     program = ["beags"]
     if spec is not None and not spec.name.startswith("beags_plugin."):
@@ -70,10 +70,10 @@ def command() -> str:
 
 def commit() -> str:
     """Return the measured commit, with "+" if files differ from it; "unknown" outside a clone of beags."""
-    found = _git("rev-parse", "--short", "HEAD")
-    if found is None or _git("ls-files", "--error-unmatch", str(_MEASURED)) is None:
+    name = _git("rev-parse", "--short", "HEAD")
+    if name is None or _git("ls-files", "--error-unmatch", str(_MEASURED)) is None:
         return "unknown"
-    return found + ("+" if _git("status", "--porcelain", "--untracked-files=no") else "")
+    return name + ("+" if _git("status", "--porcelain", "--untracked-files=no") else "")
 
 
 def _git(*arguments: str) -> str | None:

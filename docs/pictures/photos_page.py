@@ -1,4 +1,4 @@
-"""The pictures of docs/photos.md: of ``beags demo --data outputs/walk.mp4``, the video that ``walk_video.py`` writes.
+"""Make the pictures of docs/photos.md from ``beags demo --data outputs/walk.mp4``, the video of ``walk_video.py``.
 
 ``python docs/pictures/photos_page.py [--demo outputs/walk]``
 """
@@ -11,7 +11,7 @@ import tyro
 from PIL import Image
 
 WIDTH = 1000  # pixels at most
-PARTS = {  # picture: file of the demo, and which share of its height is kept
+PARTS = {  # picture to file of the demo and the upper share of its height that is shown
     "poses": ("scene/poses.png", 1.0),
     "made": ("scene/made.png", 0.4),
     "contradicted": ("scene/contradicted.png", 0.33),

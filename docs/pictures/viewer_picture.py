@@ -58,7 +58,7 @@ class Picture:
 
 
 def settled(page: Page, seconds: float = 15.0) -> np.ndarray:
-    """What the page shows once it has been the same for a while; coarse pictures come before fine ones."""
+    """Return the page's picture once it has not changed for ``seconds``; coarse pictures come before fine ones."""
     shown, since = _pixels(page), time.monotonic()
 
     def still() -> bool:

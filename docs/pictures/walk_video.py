@@ -18,7 +18,7 @@ from beags_plugin.sample.views import View, look_at, render_image
 from beags_plugin.system.progress import counted, progress_bar
 
 LENS = 1.0  # focal length over width
-RADII, HEIGHTS = (1.25, 1.0), (0.45, 0.85)  # of the two rounds, about the thing, in world units
+RADII, HEIGHTS = (1.25, 1.0), (0.45, 0.85)  # world units, for each of the two rounds about the thing
 
 
 @dataclass
@@ -32,15 +32,15 @@ class Walk:
     thing: tuple[str, ...] = ("basket", "ball")
     """Names of the objects that stay."""
     frames: int = 110
-    """Of the video."""
+    """Frames of the video."""
     width: int = 480
     """Pixels; the height is three quarters of it."""
 
     def write(self) -> None:
         room = make_room(self.seed)
-        kept = [thing for thing in room.things if thing.name in self.thing]
-        middle = np.array([*kept[0].position[:2], 0.0])
-        room = replace(room, things=tuple(replace(one, position=one.position - middle) for one in kept), contacts=())
+        things = [thing for thing in room.things if thing.name in self.thing]
+        middle = np.array([*things[0].position[:2], 0.0])
+        room = replace(room, things=tuple(replace(one, position=one.position - middle) for one in things), contacts=())
         light, height = RoomLight(room), 3 * self.width // 4
         self.output.parent.mkdir(parents=True, exist_ok=True)
         with progress_bar("Filming") as progress, av.open(str(self.output), "w") as container:

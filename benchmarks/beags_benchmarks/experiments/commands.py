@@ -93,7 +93,7 @@ else:
 
 @dataclass
 class Bench:
-    """Measure, and leave tables, JSON, CSV and a picture behind."""
+    """Measure, print tables, and write JSON, CSV and a picture."""
 
     what: Measurement
 

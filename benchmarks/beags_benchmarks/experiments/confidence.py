@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +10,7 @@ import numpy as np
 
 from beags_benchmarks.experiments.engines.interface import Outcome
 from beags_benchmarks.experiments.report import new_figure, save_figure
+from beags_benchmarks.experiments.scenes import quiet
 from beags_benchmarks.experiments.trials import VariantTrial
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.colors import colorize
@@ -21,13 +20,13 @@ if TYPE_CHECKING:
 
     from beags_plugin.runs.prepared import TrainingMasks
 
-SHOWN_DAMAGE = 2.0  # the degree that is shown, or the one nearest to it
-VIEWS = 2  # of each scene: the view that changed most, and one that had no mask
+SHOWN_DAMAGE = 2.0  # degree of damage that is shown, or the nearest one
+VIEWS = 2  # views of each scene: the one that changed most, and one without a mask
 _WRONG, _MENDED, _SPOILT, _UNKNOWN = (230, 75, 45), (60, 160, 90), (200, 0, 200), (170, 170, 170)
 
 
 def plot_confidence(path: Path, runs: Sequence[VariantTrial], outcomes: Mapping[str, Outcome]) -> None:
-    """Plot for every scene the views that changed most, of the run whose damage is nearest to strong."""
+    """Plot ``VIEWS`` of every scene, from the run whose damage is nearest to ``SHOWN_DAMAGE``."""
     rows = [(run.scene.name, view) for run in shown_runs(runs, outcomes) for view in _views(run, outcomes)]
     figure, axes = new_figure(6, max(len(rows), 1), size=(3.0, 2.6))
     for axis in axes.flat:
@@ -57,7 +56,7 @@ def _views(run: VariantTrial, outcomes: Mapping[str, Outcome]) -> list[TrainingM
     from beags_plugin.runs.prepared import training_masks
     from beags_plugin.runs.relocation import open_run
 
-    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
+    with quiet():
         views = training_masks(open_run(outcomes[run.trial.digest].folder / "run/config.yml"))
     masked = [view for view in views if view.given is not None]
     changed = sorted(masked, key=lambda view: -int((view.given != view.used).sum()))
@@ -97,7 +96,7 @@ def _plot_mask(axes: Axes, mask: np.ndarray | None, title: str, exact: np.ndarra
 
 
 def _errors(view: TrainingMasks) -> np.ndarray:
-    """Return [h, w, 3] uint8 with the wrong pixels before and after; unlabelled pixels do not count as wrong."""
+    """Return [h, w, 3] uint8 with the wrong pixels before and after; unlabelled pixels are not wrong."""
     assert view.exact is not None
     picture = np.full((*view.used.shape, 3), 235, dtype=np.uint8)
     after = (view.used != view.exact) & (view.used != IGNORE)

@@ -12,9 +12,9 @@ from beags_benchmarks.experiments.scenes import SEEDS
 from beags_plugin.system.errors import UserError, check_choice, meant
 from beags_plugin.system.shipped import read_toml
 
-FILES = Path(__file__).parent / "files"  # the experiments that come with this package
+FILES = Path(__file__).parent / "files"  # experiments of this package
 PHASES = ("base", "refine", "both")
-DAMAGE, CLASSES = "damage", "classes"  # axes that are no config keys: the degree of mask damage, a number of objects
+DAMAGE, CLASSES = "damage", "classes"  # axes without a config key: degree of mask damage, number of objects
 _ENTRIES = {
     "description", "preset", "seeds", "sample", "variant", "sweep", "paper", "reference", "confidence",
     "objects", *PHASES,
@@ -27,12 +27,11 @@ _SWEEP = {"name", "key", "values", "phase", "lines", "relative_to_pixels"}
 class Variant:
     """One way to train: its changes to the preset.
 
-    base, refine: dotted config keys and their values. damage: degree of mask damage; None leaves the masks as they are.
-    classes: number of objects in masks that are made up, with which cost alone is measured.
-    sweep, line, x: name of the sweep, its curve and the place on its axis, if the variant is a point of a sweep.
+    base, refine: dotted config keys and their values. damage: degree of mask damage; None keeps the masks. classes:
+    number of objects in artificial masks, which measure cost only.
+    sweep, line, x: name of the sweep, its curve and the position on its axis, if the variant is a point of a sweep.
     per_object: a training for each object, whose name is the option "object" of the refiner.
-    preset: what its refinement starts from in place of the experiment's. control: the variant that its PSNR is compared
-    with.
+    preset: preset of its refinement in place of the experiment's. control: the variant with which its PSNR is compared.
     """
 
     name: str
@@ -55,7 +54,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class PaperFigures:
-    """Figures of the paper, for comparison. rows: by variant, (IoU, BIoU) in percent for each column."""
+    """Figures of the paper, for comparison. rows: variant to (IoU, BIoU) in percent for each column."""
 
     source: str
     columns: tuple[str, ...]
@@ -66,11 +65,10 @@ class PaperFigures:
 class Experiment:
     """The content of ``files/<name>.toml``.
 
-    samples, sample: family and seed of the generated scenes, and other options of ``SampleConfig``. of_seed: such
-    options of the scenes of one seed alone. seeds: of the training.
-    reference: the variant that the others' errors are compared with. confidence, objects: also plot the masks'
-    confidence, or the largest objects by each variant. relative_to_pixels: sweeps whose axis is also
-    given per million training pixels.
+    samples, sample: family and seed of the generated scenes, and other options of ``SampleConfig``. of_seed: options
+    for scenes of one seed only. seeds: seeds of the training. reference: the variant with which the others' errors are
+    compared. confidence, objects: whether to plot the masks' confidence, and the largest objects by each variant.
+    relative_to_pixels: sweeps whose axis is also given per million training pixels.
     """
 
     name: str
@@ -88,7 +86,7 @@ class Experiment:
     of_seed: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
 
     def header(self) -> dict[str, str]:
-        """Return what begins every report: {"experiment", "description", "preset"}."""
+        """Return the first entries of every report: {"experiment", "description", "preset"}."""
         return {"experiment": self.name, "description": self.description, "preset": self.preset}
 
     @property
@@ -98,15 +96,15 @@ class Experiment:
 
 
 def experiment_names() -> list[str]:
-    """Return the names of the experiments that come with this package, sorted."""
+    """Return the names of the experiments of this package, sorted."""
     return sorted(path.stem for path in FILES.glob("*.toml"))
 
 
 def load_experiment(name: str) -> Experiment:
     """Read the experiment of that name, or the TOML file at that path.
 
-    Every config key is tried on the preset, so that a typo shows before anything is trained. Raises ``UserError`` if
-    there is no such experiment, or its file has a mistake.
+    Every config key is checked on the preset, so that a typo is reported before anything is trained. Raises
+    ``UserError`` if there is no such experiment, or its file has a mistake.
     """
     path = Path(name) if name.endswith(".toml") else FILES / f"{name}.toml"
     if not name.endswith(".toml"):
@@ -131,7 +129,7 @@ def check_keys(experiment: Experiment, source: Path) -> None:
 
 
 class _Reader:
-    """A reader of one file. Every mistake is a ``UserError`` that names the file and the entry."""
+    """Reads one file; every mistake is a ``UserError`` that names the file and the entry."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -140,7 +138,7 @@ class _Reader:
             self.content = self.changed(read_toml(path.with_stem(other), "experiment"))
 
     def changed(self, other: dict[str, Any]) -> dict[str, Any]:
-        """Return another experiment's content with the entries of this one, which is like it."""
+        """Return another experiment's content, changed by the entries of this one."""
         both = {phase: {**other.get(phase, {}), **self.table(self.content, phase, "")} for phase in PHASES}
         own = {key: value for key, value in self.content.items() if key != "like"}
         return {**other, **own, **{phase: table for phase, table in both.items() if table}}
@@ -233,7 +231,7 @@ class _Reader:
         return PaperFigures(self.value(table, "source", str, where="paper: "), tuple(columns), rows)
 
     def samples(self, sample: dict[str, Any]) -> tuple[tuple[str, int], ...]:
-        """Take families and seeds out of the table; the families take turns, so that the first scenes are of each."""
+        """Take families and seeds out of the table; families alternate, so that the first scenes cover all."""
         from beags_plugin.sample.families import FAMILIES
 
         families, seeds = sample.pop("families", ["tabletop"]), sample.pop("seeds", [0])

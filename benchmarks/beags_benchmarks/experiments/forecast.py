@@ -1,4 +1,4 @@
-"""What the trials of an experiment will take, by what finished ones of their kind took."""
+"""Forecasts of the trials of an experiment from finished trials of the same kind."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from beags_benchmarks.experiments.engines.interface import Needs
 from beags_benchmarks.experiments.scenes import SceneSize
 from beags_benchmarks.experiments.trials import Trial, VariantTrial
 
-BASE = "base"  # the kind of the trials that others start from
-TEMPORARY_BYTES = 18  # a training pixel between base and refinement: depth 4, lifted pixels 6, votes 8 (notes/poses.md)
-PROGRAM_MB = 1000.0  # of memory, for a trial of which nothing is known
-PIXEL_BYTES = 8  # and a training pixel of it: photos 3, masks 2, room for the rest
+BASE = "base"  # kind of trials from which others start
+TEMPORARY_BYTES = 18  # disk per training pixel during preparation: depth 4, lifted pixels 6, votes 8 (notes/poses.md)
+PROGRAM_MB = 1000.0  # memory for a trial of an unknown kind
+PIXEL_BYTES = 8  # additional memory per training pixel: photos 3, masks 2, room for the rest
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a finished trial took: seconds of wall time, cores that it kept busy (None: not known), the largest memory,
-    what of that is not the loaded program, and the size of its folder, MB."""
+    """Cost of a finished trial: seconds of wall time, busy cores (None if unknown), peak memory, the part of it without
+    the loaded program, and the size of its folder, MB."""
 
     seconds: float
     cores: float | None
@@ -34,10 +34,10 @@ class Cost:
 
 @dataclass(frozen=True)
 class SceneForecast:
-    """The trials of a scene. trials, done: their numbers. unknown: kinds of trials of which none has finished.
+    """The forecast for a scene. trials, done: numbers of trials. unknown: kinds of trials of which none has finished.
 
-    hours: of those not done. memory_mb: the largest. disk_mb: with ``temporary_mb``, which goes again. All without
-    the unknown kinds.
+    hours: time of trials that are not done. memory_mb: peak memory. disk_mb: disk, including ``temporary_mb``, which is
+    freed again. All are without unknown kinds.
     """
 
     title: str
@@ -52,10 +52,10 @@ class SceneForecast:
 
 
 class Forecast:
-    """Foretells trials by finished ones of their kind: a variant's refinements, or bases with the same options.
+    """Forecasts trials from finished ones of their kind: a variant's refinements, or bases with the same options.
 
-    sizes: of each scene, by name. folder: of all trials. Time, and what lies on disk, are taken to grow with the
-    training pixels.
+    sizes: sizes of scenes by name. folder: folder of all trials. Time and disk are assumed to be proportional to the
+    number of training pixels.
     """
 
     def __init__(self, runs: Sequence[VariantTrial], sizes: Mapping[str, SceneSize], folder: Path) -> None:
@@ -67,15 +67,15 @@ class Forecast:
                 options = {key: repr(value) for key, value in trial.base.overrides.items()}
                 self._kinds[trial.base.digest] = (BASE, json.dumps(options, sort_keys=True)), trial.base
                 self._kinds[trial.digest] = (run.variant.name, ""), trial
-        self._costs: dict[str, Cost] = {}  # of finished trials, by digest
+        self._costs: dict[str, Cost] = {}  # costs of finished trials by digest
 
     def scenes(self, titles: Mapping[str, str] | None = None) -> list[SceneForecast]:
-        """Return a forecast for each scene. titles: of scenes, if not their names."""
+        """Return a forecast for each scene; titles: name to title, if not the name."""
         known = self._known({kind for kind, _ in self._kinds.values()})
         return [self._scene(name, (titles or {}).get(name, name), known) for name in self._sizes]
 
     def needs(self, trial: Trial) -> Needs:
-        """Return what a trial is expected to take; memory is the largest measured, more for more training pixels."""
+        """Return the expected needs of a trial; memory is the largest measured, scaled up for more training pixels."""
         pixels = self._sizes[trial.scene.name].pixels
         kind = self._kinds[trial.digest][0]
         if not (costs := self._known([kind]).get(kind, [])):
@@ -86,7 +86,7 @@ class Forecast:
         return Needs(max(1, math.ceil(max(cores) - 0.25)) if cores else None, memory)
 
     def _known(self, kinds: Container[tuple[str, str]]) -> dict[tuple[str, str], list[Cost]]:
-        """Return the costs of finished trials of these kinds; looks for those that have finished since."""
+        """Return the costs of finished trials of these kinds, including trials that finished since the last call."""
         known: dict[tuple[str, str], list[Cost]] = {}
         for digest, (kind, trial) in self._kinds.items():
             if kind in kinds and digest not in self._costs:
@@ -100,26 +100,26 @@ class Forecast:
     def _scene(self, name: str, title: str, known: Mapping[tuple[str, str], Sequence[Cost]]) -> SceneForecast:
         size = self._sizes[name]
         own = {digest: kind for digest, (kind, trial) in self._kinds.items() if trial.scene.name == name}
-        left = [kind for digest, kind in own.items() if digest not in self._costs]
-        foretold = [kind for kind in left if kind in known]
-        scaled = [_mean(known[kind], size.pixels) for kind in foretold]
-        refines = any(kind[0] != BASE for kind in left)
+        to_do = [kind for digest, kind in own.items() if digest not in self._costs]
+        forecast = [kind for kind in to_do if kind in known]
+        scaled = [_mean(known[kind], size.pixels) for kind in forecast]
+        refines = any(kind[0] != BASE for kind in to_do)
         temporary = TEMPORARY_BYTES * size.pixels / 1e6 if refines else 0.0
         return SceneForecast(
             title,
             size,
             len(own),
-            len(own) - len(left),
+            len(own) - len(to_do),
             sum(seconds for seconds, _ in scaled) / 3600.0,
-            max((cost.memory_mb for kind in foretold for cost in known[kind]), default=0.0),
+            max((cost.memory_mb for kind in forecast for cost in known[kind]), default=0.0),
             sum(disk for _, disk in scaled) + temporary,
             temporary,
-            tuple(dict.fromkeys(kind[0] for kind in left if kind not in known)),
+            tuple(dict.fromkeys(kind[0] for kind in to_do if kind not in known)),
         )
 
 
 def _cost(folder: Path, pixels: int) -> Cost | None:
-    """Return what the trial in ``folder`` took, or None if it has not finished."""
+    """Return the cost of the trial in ``folder``; None if it has not finished."""
     try:
         result: Mapping[str, Any] = json.loads((folder / "result.json").read_text())
         size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
@@ -133,7 +133,7 @@ def _cost(folder: Path, pixels: int) -> Cost | None:
 
 
 def _mean(costs: Sequence[Cost], pixels: int) -> tuple[float, float]:
-    """Return seconds and MB on disk for a scene of so many training pixels."""
+    """Return the mean seconds and MB on disk, scaled to ``pixels`` training pixels."""
     scale = [pixels / cost.pixels for cost in costs]
     seconds = sum(cost.seconds * factor for cost, factor in zip(costs, scale, strict=True)) / len(costs)
     return seconds, sum(cost.disk_mb * factor for cost, factor in zip(costs, scale, strict=True)) / len(costs)

@@ -19,17 +19,17 @@ if TYPE_CHECKING:
     from beags_plugin.objects.evaluate import EvaluatedRun
 
 _SIDE = 150  # pixels of a cell
-_LETTERS = 26  # of a caption in a cell
+_LETTERS = 26  # letters in a line of a caption
 _COLUMNS = 10  # variants of a picture
-_LINES = 16  # objects of a picture, where scenes have so many
+_LINES = 16  # most objects of a picture
 
 
 def plot_objects(path: Path, runs: Sequence[VariantTrial], outcomes: Mapping[str, Outcome]) -> list[Path]:
     """Draw a line for each object, in the held-out view that shows most of it; a column for each variant.
 
-    Of many objects only the largest of each scene are drawn, ``_LINES`` in all or one of each; many variants are shared
-    out to several pictures: ``path``, and after it those with 2, 3, .. in their name. Returns their paths. A variant
-    that failed has an empty cell.
+    Only the largest objects of each scene are drawn, ``_LINES`` in all or one for each scene. Many variants are divided
+    among several pictures: ``path``, then those with 2, 3, .. in their names. Returns their paths. A failed variant has
+    an empty cell.
     """
     from beags_plugin.pictures.cells import write_picture
 
@@ -45,7 +45,7 @@ def plot_objects(path: Path, runs: Sequence[VariantTrial], outcomes: Mapping[str
 
 
 def pages(lines: Sequence[Sequence[np.ndarray]], columns: int = _COLUMNS) -> list[np.ndarray]:
-    """Return pictures of these lines of cells: at most so many of a line in each, alike, after the line's first one."""
+    """Return pictures of lines of cells: each has the first cell of a line and at most ``columns`` of the others."""
     from beags_plugin.pictures.cells import below, beside
 
     if not lines:
@@ -65,7 +65,7 @@ def _objects(
     """Return the cells of the ``most`` largest objects of a scene, each with its photo first."""
     from beags_plugin.core.select import select_class
     from beags_plugin.objects.evaluate import EvaluatedRun
-    from beags_plugin.pictures.cells import cell, crop, square_around
+    from beags_plugin.pictures.cells import as_bytes, cell, crop, square_around
     from beags_plugin.pictures.object_cells import alone, over_board
     from beags_plugin.runs.read import read_run
 
@@ -89,7 +89,7 @@ def _objects(
             drawn.append(image)
         shape = next((image.shape[:2] for image in drawn if image is not None), truth.shape)
         window = square_around(truth if truth.shape == shape else np.ones(shape, dtype=bool))
-        photo = (view.image.clamp(0, 1) * 255).byte().cpu().numpy()
+        photo = as_bytes(view.image)
         white = np.full((_SIDE, _SIDE, 3), 255, np.uint8)
         pictures = [
             crop(photo, window),
@@ -101,14 +101,14 @@ def _objects(
 
 
 def captioned(names: Sequence[str], letters: int = _LETTERS) -> list[str]:
-    """Return the names in lines of at most so many letters, as many lines of each, so that cells are alike."""
+    """Return names in lines of at most ``letters`` letters, all with the same number of lines, so that cells align."""
     lines = [textwrap.wrap(name, letters) or [""] for name in names]
     most = max(map(len, lines))
     return ["\n".join([*each, *[""] * (most - len(each))]) for each in lines]
 
 
 def _largest(run: EvaluatedRun, most: int) -> dict[int, tuple[EvalView, np.ndarray]]:
-    """Return the ids of the objects of which a held-out view shows most pixels, the view, and its mask [H, W] bool."""
+    """Return the largest objects: id to the held-out view that shows most pixels of it, and its mask [H, W] bool."""
     from beags_plugin.evaluation.truths import extracted_truth
 
     found: list[tuple[int, int, EvalView, np.ndarray]] = []
@@ -123,5 +123,5 @@ def _largest(run: EvaluatedRun, most: int) -> dict[int, tuple[EvalView, np.ndarr
 
 
 def _cuts(trial: Trial, name: str) -> bool:
-    """Return whether a trial cuts the object out: all of them, or its own alone."""
+    """Return whether a trial takes out the object, as all objects or as its only one."""
     return trial.overrides.get(OPTIONS, {}).get(OBJECT, name) == name

@@ -13,12 +13,12 @@ from beags_plugin.system.output_option import OUTPUT
 
 @dataclass(kw_only=True)
 class EngineOptions:
-    """Where trials run, and whether they do."""
+    """The engine for trials."""
 
     plan: bool = False
-    """Only print the trials, and the hours, memory and disk that they will take."""
+    """Only print the trials and the hours, memory and disk that they need."""
     engine: str = "local"
-    """What runs the trials: local (this machine, one after the other) or ray (a Ray cluster; docs/experiments.md)."""
+    """Engine for the trials: local (this machine, one after the other) or ray (a Ray cluster; docs/experiments.md)."""
     address: str | None = None
     """Address of the Ray cluster: auto (the one that this machine is part of), or host:port; if left out, Ray is
     started on this machine alone."""
@@ -31,13 +31,13 @@ class ExperimentOptions(EngineOptions):
     data: tuple[Path, ...] = ()
     """Folders with images, poses and masks to train on, instead of the experiment's samples."""
     scenes: int | None = None
-    """How many of the experiment's sample scenes; all if left out, none where --data is given."""
+    """Number of the experiment's sample scenes; all if left out, none with --data."""
     preset: str | None = None
-    """What to train with: a preset of method_configs/; the experiment's own if left out."""
+    """Preset of method_configs/; the experiment's own if left out."""
     downscale: float | None = None
     """Divide the image size of --data by this; chosen for a quick run if left out."""
     variants: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--methods"])] = ()
-    """Which of the experiment's variants to run, besides the one that it compares with; "all", or left out: all."""
+    """Which of the experiment's variants to run, besides its reference; all with "all" or if left out."""
     quick: bool = False
     """Try the experiment out in a minute or two: tiny scenes, few steps, figures that mean nothing."""
     output: Annotated[Path, OUTPUT] = Path("outputs/bench")

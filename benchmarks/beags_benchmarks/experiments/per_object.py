@@ -1,14 +1,13 @@
-"""Methods that make a scene of its own for each object: their trials, and one result of them all."""
+"""Methods that train a separate scene for each object: their trials, and one merged result."""
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from beags_benchmarks.experiments.scenes import TrialScene
+from beags_benchmarks.experiments.scenes import TrialScene, quiet
+from beags_plugin.evaluation.metrics import mean
 from beags_plugin.evaluation.records import FIGURES, IMAGE_FIGURES
 from beags_plugin.evaluation.report import STAGES
 
@@ -23,7 +22,7 @@ def object_names(scene: TrialScene) -> list[str]:
         from beags_plugin.sample.families import FAMILIES
 
         return [name for class_id, name in FAMILIES[sample.family].scene(sample.seed).class_names.items() if class_id]
-    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
+    with quiet():
         outputs = scene.parser().setup().get_dataparser_outputs("train")
     return [name for class_id, name in sorted(outputs.metadata["classes"].items()) if class_id != 0]
 
@@ -31,8 +30,8 @@ def object_names(scene: TrialScene) -> list[str]:
 def merged(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Return the worker's results for single objects, by name, as one result.
 
-    Masks and removals of an object are those of its own scene. Figures of images are means over the scenes; seconds and
-    steps are sums, memory is the largest.
+    Masks and removals of an object come from its own scene. Metrics of images are means over the scenes, seconds and
+    steps are sums, memory is the largest value.
     """
     first = next(iter(results.values()))
     own = {name: result["evaluation"]["objects"][name] for name, result in results.items()}
@@ -42,14 +41,14 @@ def merged(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     evaluation: dict[str, Any] = {**first["evaluation"], "objects": own, "masks": masks}
     evaluation["mean"] = {
         kind: {
-            stage: {metric: _mean(m[stage][metric] for m in masks if m["kind"] == kind) for metric in metrics}
+            stage: {metric: mean(m[stage][metric] for m in masks if m["kind"] == kind) for metric in metrics}
             for stage in STAGES
         }
         for kind, metrics in FIGURES.items()
     }
     for figure in IMAGE_FIGURES:
         evaluation[figure] = {
-            stage: _mean(result["evaluation"][figure][stage] for result in results.values()) for stage in STAGES
+            stage: mean(result["evaluation"][figure][stage] for result in results.values()) for stage in STAGES
         }
     stages = {stage for result in results.values() for stage in result["seconds"]}
     seconds = {stage: math.fsum(result["seconds"].get(stage, 0.0) for result in results.values()) for stage in stages}
@@ -57,7 +56,7 @@ def merged(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         **first,
         "evaluation": evaluation,
         "seconds": seconds,
-        "gaussians": _mean(result["gaussians"] for result in results.values()),
+        "gaussians": mean(result["gaussians"] for result in results.values()),
         **{name: _sum([result[name] for result in results.values()]) for name in _SUMS},
         **{name: max(result[name] for result in results.values()) for name in _LARGEST},
     }
@@ -65,8 +64,3 @@ def merged(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 def _sum(values: Sequence[float | None]) -> float | None:
     return None if None in values else sum(value for value in values if value is not None)
-
-
-def _mean(values: Iterable[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return math.fsum(known) / len(known) if known else None

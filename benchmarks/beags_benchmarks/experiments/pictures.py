@@ -22,16 +22,16 @@ _CURVES = (
     ("peak_memory_mb", "peak memory, MB", 1.0),
 )
 _PAPER_MARKS = "ovs^Dp*X"
-_WIDTH, _HEIGHT = 4.4, 3.6  # of one diagram, inches
-_BAR_HEIGHT = 0.22  # so that the names of many bars do not touch
-_FEW = 4  # lines of a sweep, with their dashes, that a legend within a diagram has room for
+_WIDTH, _HEIGHT = 4.4, 3.6  # inches of one diagram
+_BAR_HEIGHT = 0.22  # inches, at which the names of many bars do not overlap
+_FEW = 4  # most lines of a sweep for a legend within a diagram
 _COLORS, _MARKS = 10, "osD^"
 
 
 def plot_experiment(path: Path, experiment: Experiment, rows: Sequence[ResultRow]) -> None:
     """Plot a row of bars for the variants and a row of curves per sweep; the suffix of ``path`` gives the format.
 
-    A diagram without any figure is left out of a picture of sweeps alone.
+    If there are only sweeps, diagrams without figures are left out.
     """
     variants = [row for row in rows if not row.variant.sweep]
     known = [curve for curve in _CURVES if any(row.figures[curve[0]] is not None for row in rows)]
@@ -58,7 +58,7 @@ def _bars(
     axes: Axes, experiment: Experiment, rows: Sequence[ResultRow], metric: str, title: str, paper: int | None,
     labels: bool,
 ) -> None:  # fmt: skip
-    """Plot bars of the means, a dot per scene, and the paper's figures as hollow marks. paper: index in its pairs."""
+    """Plot bars of means, a dot for each scene, and the paper's figures as hollow marks. paper: index in its pairs."""
     factor = 100.0 if title.endswith("%") else 1.0
     names = list(dict.fromkeys(row.variant.name for row in rows))
     place = {name: len(names) - 1 - index for index, name in enumerate(names)}
@@ -87,7 +87,7 @@ def _bars(
 
 
 def _curves(axes: Axes, rows: Sequence[ResultRow], sweep: str, metric: str, title: str, factor: float) -> None:
-    """Plot means as thick lines, assignment alone dashed, scenes thin, with a colour per line of the sweep."""
+    """Plot means as thick lines, assignment alone dashed, scenes thin, with one colour for each line of the sweep."""
     lines = list(dict.fromkeys(row.variant.line for row in rows))
     for index, line in enumerate(lines):
         color, mark = f"C{index % _COLORS}", _MARKS[index // _COLORS % len(_MARKS)]
@@ -113,7 +113,7 @@ def _curves(axes: Axes, rows: Sequence[ResultRow], sweep: str, metric: str, titl
 
 
 def _legend(axes: Sequence[Axes]) -> None:
-    """Name the lines of a row of diagrams: in the last one, of memory, which has room, or beside it if many."""
+    """Add the legend of a row of diagrams to the last one, of memory, which has room, or beside it if it is long."""
     if len(axes[0].get_legend_handles_labels()[0]) <= 2 * _FEW:
         axes[-1].legend(*axes[0].get_legend_handles_labels(), fontsize="x-small")
     else:

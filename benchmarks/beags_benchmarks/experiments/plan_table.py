@@ -1,4 +1,4 @@
-"""The plan of an experiment for a terminal: its trials, and the hours, memory and disk that they will take."""
+"""The plan of an experiment for a terminal: its trials and the hours, memory and disk that they need."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 _MISSING = "–"
-_MOST_KINDS = 6  # that a line names
+_MOST_KINDS = 6  # kinds named in a line
 
 
 def plan_table(forecasts: Sequence[SceneForecast]) -> Table:
-    """Return the trials of each scene and what they will take; a dash where nothing of the kind has finished."""
+    """Return the trials of each scene and their needs; a dash if no trial of the kind has finished."""
     rows = []
     for each in forecasts:
         known = each.trials - each.done > 0 and not each.unknown
@@ -39,12 +39,12 @@ def plan_table(forecasts: Sequence[SceneForecast]) -> Table:
 
 
 def plan_lines(forecasts: Sequence[SceneForecast], smallest: str) -> list[str]:
-    """Return the sums over all scenes, and which kinds of trials nothing is known of.
+    """Return sentences with the sums over all scenes and the kinds of trials without a forecast.
 
-    smallest: the option with which one of each kind finishes soon.
+    smallest: the option with which one trial of each kind finishes soon.
     """
-    left = sum(each.trials - each.done for each in forecasts)
-    lines = [f"{sum(each.trials for each in forecasts)} trials, {left} of them not done."]
+    to_do = sum(each.trials - each.done for each in forecasts)
+    lines = [f"{sum(each.trials for each in forecasts)} trials, {to_do} of them not done."]
     if unknown := list(dict.fromkeys(kind for each in forecasts for kind in each.unknown)):
         more = len(unknown) - _MOST_KINDS
         names = ", ".join(unknown[:_MOST_KINDS]) + (f" and {more} more" if more > 0 else "")
@@ -52,7 +52,7 @@ def plan_lines(forecasts: Sequence[SceneForecast], smallest: str) -> list[str]:
             f"Hours, memory and disk of {names} are known once one of each has finished here ({smallest}); they are "
             "then scaled by the training pixels."
         )
-    elif left:
+    elif to_do:
         hours, disk = sum(each.hours for each in forecasts), sum(each.disk_mb - each.temporary_mb for each in forecasts)
         memory = max(each.memory_mb for each in forecasts)
         lines.append(

@@ -1,4 +1,4 @@
-"""Files, tables and figures of every measurement, and the source of its numbers."""
+"""Files, tables and plots of measurements, and the source of their numbers."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
 
-LINE = 4_000  # characters of a row of JSON that stays one line
-_LOGARITHMIC = 20.0  # above it, a linear axis would crowd small values at one end
+LINE = 4_000  # most characters of a row of JSON on one line
+_LOGARITHMIC = 20.0  # ratio of values above which an axis is logarithmic
 
 
 def provenance() -> dict[str, Any]:
@@ -34,7 +34,7 @@ def provenance() -> dict[str, Any]:
 
 
 def write_json(path: Path, report: Mapping[str, Any]) -> None:
-    """Write the report, a row on a line, and make its folder."""
+    """Write the report with one line for each row, and make its folder."""
     write_text_atomically(_json_lines(report, "") + "\n", path)
 
 
@@ -63,7 +63,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def new_table(title: str, columns: Sequence[str]) -> Table:
-    """Return an empty table for a terminal. The first column is text, the others are figures."""
+    """Return an empty table for a terminal; the first column is text, the others are numbers."""
     from rich.box import SIMPLE
     from rich.table import Table
     from rich.text import Text
@@ -75,7 +75,7 @@ def new_table(title: str, columns: Sequence[str]) -> Table:
 
 
 def plain_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    """Return a table of these cells, none of which is markup."""
+    """Return a table of these cells, without markup."""
     from rich.text import Text
 
     table = new_table(title, columns)
@@ -85,12 +85,12 @@ def plain_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
 
 
 def number(value: float | None, digits: int, factor: float = 1.0) -> str:
-    """Return a figure times ``factor`` as text, or a dash for None."""
+    """Return a number times ``factor`` as text, or a dash for None."""
     return "–" if value is None else f"{factor * value:.{digits}f}"
 
 
 def new_figure(columns: int, rows: int = 1, size: tuple[float, float] = (4.4, 3.6)) -> tuple[Figure, Any]:
-    """Return a figure that needs no screen, and its axes [rows][columns]. size: of each, in inches."""
+    """Return a figure that needs no screen, and its axes [rows][columns]. size: inches of each axes."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -102,14 +102,14 @@ def new_figure(columns: int, rows: int = 1, size: tuple[float, float] = (4.4, 3.
 
 
 def scale_axis(set_scale: Callable[[str], None], values: Sequence[float | None]) -> None:
-    """Make an axis logarithmic where the values span more than the factor ``_LOGARITHMIC``; None: no value."""
+    """Make an axis logarithmic if the ratio of its values exceeds ``_LOGARITHMIC``; None is no value."""
     known = [value for value in values if value is not None]
     if known and min(known) > 0 and max(known) / min(known) > _LOGARITHMIC:
         set_scale("log")
 
 
 def save_figure(path: Path, figure: Figure) -> None:
-    """Write the picture as PNG (or the format of the suffix), and make its folder."""
+    """Write the picture in the format of its suffix, and make its folder."""
     from matplotlib import pyplot
 
     with writing(path):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from beags_benchmarks.experiments.experiment import Experiment, Variant
+from beags_plugin.evaluation.metrics import mean
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import FIGURES as METRICS
 from beags_plugin.evaluation.records import IMAGE_FIGURES
@@ -15,18 +15,18 @@ from beags_plugin.evaluation.report import STAGES as MOMENTS
 from beags_plugin.evaluation.table import protocol_sentence
 
 STAGES = ("base training", "reprojection", "assignment", "voxel grids", "objects", "refinement")
-MEAN = "mean"  # in the column "object": over all masks of the scene
+MEAN = "mean"  # value of the column "object" for all masks of the scene
 _PLACE = ("scene", "seed", "variant", "sweep", "line", "x", "object", "failed")
 _COSTS = ("cpu_seconds", "peak_memory_mb", "own_memory_mb", "steps", "gaussians")
 _QUALITY = tuple(f"{metric}_{moment}" for metric in IMAGE_FIGURES for moment in MOMENTS) + tuple(
     f"{kind}_{metric}_{moment}" for kind, metrics in METRICS.items() for metric in metrics for moment in MOMENTS
 )
 _WORST, _LOST = "worst_biou_after", "lost_biou"
-_OBJECTS = (_WORST, _LOST)  # extracted BIoU of the worst object; the most that an object loses against before
+_OBJECTS = (_WORST, _LOST)  # extracted BIoU of the worst object, and the largest loss of an object by refinement
 _MASKS = ("mask_error_given", "mask_error_used")
 _SCALE = ("voxel_size", "training_pixels")
-_OWN = ("labelled_share",)  # of refiners that learn codes: of the labelled training pixels those that got their class
-_TOTAL = "cpu_seconds total"  # of the base and the refinement
+_OWN = ("labelled_share",)  # share of labelled training pixels with their class, from refiners that train codes
+_TOTAL = "cpu_seconds total"  # base and refinement
 _STAGES = tuple(f"seconds {stage}" for stage in STAGES)
 FIGURES = (*_QUALITY, *_OBJECTS, *_STAGES, _TOTAL, *_COSTS, *_MASKS, *_SCALE, *_OWN)
 COLUMNS = (*_PLACE, *FIGURES)
@@ -36,10 +36,10 @@ COLUMNS = (*_PLACE, *FIGURES)
 class ResultRow:
     """A variant on a scene, or its mean over scenes.
 
-    figures: values by the names of ``FIGURES``, None where there is none; mask metrics in 0..1. objects: the same of
-    each object. failed: the reason for missing figures, in a sentence. count: number of scenes and seeds in a mean;
-    failures: number of those that it lacks. protocol, truth: of the evaluation of one trial, see
-    ``SceneMetrics.extracted_truth``; None in a mean or where it failed. colors_fitted: see ``SceneMetrics`` too.
+    figures: values by the names of ``FIGURES``, or None; mask metrics in 0..1. objects: the same for each object.
+    failed: the reason for missing figures, in a sentence. count: number of scenes and seeds in a mean. failures: number
+    of failed ones. protocol: the evaluation's. truth, colors_fitted: see ``SceneMetrics.extracted_truth`` and
+    ``colors_fitted``. protocol and truth are None in a mean and for a failed trial.
     """
 
     variant: Variant
@@ -59,7 +59,7 @@ def make_row(
     variant: Variant, scene: str, seed: int, base: Mapping[str, Any] | None, result: Mapping[str, Any] | None,
     failed: str | None,
 ) -> ResultRow:  # fmt: skip
-    """Return the row of one trial. base, result: the worker's results for the base and the refinement, if there are."""
+    """Return the row of one trial; base, result: the worker's results for the base and the refinement, or None."""
     if base is None or result is None:
         return ResultRow(variant, scene, seed, dict.fromkeys(FIGURES), {}, failed or "it has no result")
     evaluation = result["evaluation"]
@@ -68,9 +68,9 @@ def make_row(
     seconds = {**result["seconds"], "base training": base["seconds"]["base training"]}
     figures |= {f"seconds {stage}": seconds.get(stage) for stage in STAGES}
     figures |= {name: result[name] for name in (*_COSTS, *_MASKS, *_SCALE)} | {name: result.get(name) for name in _OWN}
-    parts = (base["cpu_seconds"], result["cpu_seconds"])  # None: it was interrupted
+    parts = (base["cpu_seconds"], result["cpu_seconds"])  # None after an interruption
     figures[_TOTAL] = None if None in parts else sum(parts)
-    objects = {name: _masks(found) for name, found in evaluation["objects"].items()}
+    objects = {name: _masks(metrics) for name, metrics in evaluation["objects"].items()}
     after, before = "extracted_biou_after", "extracted_biou_before"
     pairs = [(of[before], of[after]) for of in objects.values()]
     figures[_WORST] = min((end for _, end in pairs if end is not None), default=None)
@@ -81,10 +81,10 @@ def make_row(
     return ResultRow(variant, scene, seed, figures, objects, protocol=protocol, truth=truth, colors_fitted=fitted)
 
 
-def _masks(found: Mapping[str, Any]) -> dict[str, float | None]:
+def _masks(evaluation: Mapping[str, Any]) -> dict[str, float | None]:
     """Return the mask figures of ``RunMetrics.to_json``, {kind: {moment: {metric: value}}}, by names of ``FIGURES``."""
     return {
-        f"{kind}_{metric}_{moment}": found[kind][moment][metric]
+        f"{kind}_{metric}_{moment}": evaluation[kind][moment][metric]
         for kind, metrics in METRICS.items()
         for metric in metrics
         for moment in MOMENTS
@@ -94,8 +94,8 @@ def _masks(found: Mapping[str, Any]) -> dict[str, float | None]:
 def means(rows: Sequence[ResultRow]) -> list[ResultRow]:
     """Return each variant's mean of every figure over its scenes and seeds, without failed trials.
 
-    Those of the worst object are the worst of all scenes. A figure that some scene lacks is averaged over those that
-    have it. A variant whose trials all failed keeps the first reason.
+    The figures of the worst object are the worst of all scenes. A figure is averaged over the scenes that have it. A
+    variant whose trials all failed keeps the first reason.
     """
     of_variant: dict[str, list[ResultRow]] = {}
     for row in rows:
@@ -103,18 +103,13 @@ def means(rows: Sequence[ResultRow]) -> list[ResultRow]:
     averaged = []
     for group in of_variant.values():
         good = [row for row in group if row.failed is None]
-        figures = {name: _mean(row.figures[name] for row in good) for name in FIGURES}
+        figures = {name: mean(row.figures[name] for row in good) for name in FIGURES}
         for name, worst in ((_WORST, min), (_LOST, max)):
             figures[name] = worst((value for row in good if (value := row.figures[name]) is not None), default=None)
         failures = len(group) - len(good)
         reason = None if good else group[0].failed
         averaged.append(ResultRow(group[0].variant, MEAN, None, figures, {}, reason, len(good), failures))
     return averaged
-
-
-def _mean(values: Iterable[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return math.fsum(known) / len(known) if known else None
 
 
 def protocol_of(rows: Sequence[ResultRow]) -> str | None:

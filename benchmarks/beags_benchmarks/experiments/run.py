@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
+from rich.table import Table
 
 from beags_benchmarks.experiments.engines import open_engine
 from beags_benchmarks.experiments.engines.interface import Engine, Outcome
@@ -32,12 +33,12 @@ from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.progress import progress_bar
 
 CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-TABLE_WIDTH = 256  # a narrow terminal breaks the lines, which is better than cells that are cut short
+TABLE_WIDTH = 256  # lines that a narrow terminal breaks are better than truncated cells
 QUICK_SAMPLE = {"width": 96, "height": 72, "num_train": 16, "num_test": 3}
 QUICK_BASE = {"base_steps": 220, "schedule_steps": 0, "densify.start": 50, "densify.stop": 180}
 QUICK_REFINE = {"refine_steps": 10}
-EVERY = "all"  # of --variants, where no variant is called that
-QUICK_MOST = 30  # steps of variants that say how many
+EVERY = "all"  # value of --variants for all, unless a variant has that name
+QUICK_MOST = 30  # most steps of variants that set their number
 
 
 def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
@@ -53,7 +54,7 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
 
     experiment = adapted(load_experiment(name), options)
     source = provenance()
-    busy = busy_note(int(source["machine"]["cores"]))  # before the trials: they keep the machine busy
+    busy = busy_note(int(source["machine"]["cores"]))  # read before the trials, which keep the machine busy
     if busy:
         CONSOLE.print(f"Note: {busy}.")
     with open_engine(options) as engine:
@@ -72,8 +73,7 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
             return []
         outcomes = trained(runs, trials_folder, engine, forecast)
     rows = rows_of(runs, outcomes)
-    for table in tables(experiment, rows):
-        _wide().print(table)
+    print_tables(tables(experiment, rows))
     files = options.files(experiment.name)
     picture = files["picture"]
     about = {**source, "busy": busy, "quick": options.quick, "processors": processors(outcomes)}
@@ -94,40 +94,43 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
 def print_plan(forecasts: Sequence[SceneForecast], smallest: str, table: bool) -> None:
     """Print what the trials will take; smallest: see ``plan_lines``. table: scene by scene too."""
     if table:
-        _wide().print(plan_table(forecasts))
+        print_tables([plan_table(forecasts)])
     for line in plan_lines(forecasts, smallest):
         CONSOLE.print(line)
 
 
 def trained(runs: Sequence[VariantTrial], folder: Path, engine: Engine, forecast: Forecast) -> dict[str, Outcome]:
-    """Run the trials that are not done, with a progress bar; folder: of all trials. Returns outcomes by digest."""
+    """Run the trials that are not done, with a progress bar; folder: holds all trials. Returns outcomes by digest."""
     trials = [trial for run in runs for trial in run.trials]
     with progress_bar("Training, in steps") as progress:
         outcomes = run_trials(trials, folder, steps_of, engine, progress, forecast.needs)
-    if len(found := processors(outcomes)) > 1:
-        CONSOLE.print(f"Note: trials ran on {' and '.join(found)}, which round in different ways.")
+    if len(names := processors(outcomes)) > 1:
+        CONSOLE.print(f"Note: trials ran on {' and '.join(names)}, which round differently.")
     return outcomes
 
 
 def processors(outcomes: Mapping[str, Outcome]) -> list[str]:
-    """Return the names of the processors, or GPUs, that trained."""
+    """Return the names of the processors or GPUs that trained."""
     results = [outcome.result for outcome in outcomes.values() if outcome.result is not None]
     return sorted({result["processor"] for result in results if "processor" in result})
 
 
-def _wide() -> Console:
-    return Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
+def print_tables(tables: Sequence[Table | str]) -> None:
+    """Print tables at ``TABLE_WIDTH`` or more, and sentences between them."""
+    wide = Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
+    for table in tables:
+        (CONSOLE if isinstance(table, str) else wide).print(table)
 
 
 def _other_masks(scene: TrialScene, variant: Variant, folder: Path, write: bool) -> Path | None:
-    """Return the folder of the masks that a variant has in place of the scene's; None for those."""
+    """Return the folder of a variant's own masks; None for the scene's masks."""
     if variant.classes is not None:
         return class_masks(scene, variant.classes, folder, write)
     return None if variant.damage is None else damaged_masks(scene, variant.damage, folder, write)
 
 
 def adapted(experiment: Experiment, options: ExperimentOptions) -> Experiment:
-    """Return the experiment with another preset or, for --quick, so small that its figures mean nothing."""
+    """Return the experiment with the variants, the preset and, for --quick, the tiny sizes of the options."""
     known = [variant.name for variant in experiment.variants]
     if options.variants and (EVERY in known or EVERY not in options.variants):
         known += [name for name in dict.fromkeys(each.split(", ")[0] for each in known) if name not in known]
@@ -157,7 +160,7 @@ def adapted(experiment: Experiment, options: ExperimentOptions) -> Experiment:
 
 
 def _thinned(variants: Sequence[Variant]) -> list[Variant]:
-    """Return all plain variants, and of each line of a sweep the first and the last."""
+    """Return all plain variants, and the first and the last of each line of a sweep."""
     lines: dict[tuple[str, str], list[Variant]] = {}
     for variant in variants:
         key = (variant.sweep, variant.line) if variant.sweep else (variant.name, "")
@@ -168,7 +171,7 @@ def _thinned(variants: Sequence[Variant]) -> list[Variant]:
 def scenes_of(experiment: Experiment, options: ExperimentOptions) -> list[TrialScene]:
     """Return the experiment's samples (none by default if the user gives data) and the user's folders.
 
-    A plan writes no sample. Raises ``UserError`` if there are none at all, or fewer samples than asked for.
+    A plan writes no sample. Raises ``UserError`` if there are no scenes, or fewer samples than requested.
     """
     given = given_scenes(options.data, options.downscale)
     count = options.scenes if options.scenes is not None else (0 if given else len(experiment.samples))

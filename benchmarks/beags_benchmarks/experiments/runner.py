@@ -1,4 +1,4 @@
-"""The order of trials: bases before what starts from them, and nothing that is done already."""
+"""The order of trials: bases first, then their refinements, without trials that are done."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def run_trials(
     """Run every trial, and its base before it, unless it is done; returns outcomes by digest.
 
     folder: holds a folder for each trial. weight: share of a trial in the progress, e.g. its number of steps. engine:
-    a context that was entered. needs: forecast of a trial, asked for when it begins. The other trials run although one
-    fails. The next call runs again what failed, and goes on with what was interrupted.
+    an entered context. needs: forecast of a trial, called when it begins. If a trial fails, the others still run. The
+    next call repeats failed trials and continues interrupted ones.
     """
-    queue = {trial.digest: trial for wanted in trials for trial in (wanted.base, wanted) if trial is not None}
+    queue = {trial.digest: trial for last in trials for trial in (last.base, last) if trial is not None}
     jobs = {digest: _job(order, trial, folder.absolute()) for order, (digest, trial) in enumerate(queue.items())}
     total = sum(weight(trial) for trial in queue.values())
     outcomes: dict[str, Outcome] = {}
@@ -60,7 +60,7 @@ def _job(order: int, trial: Trial, folder: Path) -> Job:
 
 
 def _without_running(job: Job, outcomes: dict[str, Outcome]) -> Outcome | None:
-    """Return the outcome of a job that has one already: it is done, or its base failed."""
+    """Return the outcome of a job that is done or whose base failed; None for others."""
     if job.trial.base is not None and (failed := outcomes[job.trial.base.digest].failed) is not None:
         return Outcome(job.folder, None, f"its base failed: {failed}")
     result = finished(job.folder)

@@ -1,4 +1,4 @@
-"""Scenes of an experiment on disk: generated samples, the user's folders, and copies of masks with damage."""
+"""Scenes of an experiment on disk: generated samples, the user's folders, and damaged copies of masks."""
 
 from __future__ import annotations
 
@@ -22,20 +22,27 @@ from beags_plugin.system.reading.arrays import load_array
 from beags_plugin.system.whole_files import write_text_atomically
 
 if TYPE_CHECKING:
+    from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+
     from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
     from beags_plugin.sample.writer import SampleConfig
 
 SEEDS = {"choosing": (0, 1, 2), "reporting": (100, 101, 102, 103, 104)}
-"""Seeds of generated scenes. No choice is made by a result on those for reporting."""
+"""Seeds of generated scenes; results on the seeds for reporting must not decide on choices."""
+
+
+def quiet() -> contextlib.AbstractContextManager[object]:
+    """Drop what is printed in the block: nerfstudio lists its splits."""
+    return contextlib.redirect_stdout(io.StringIO())
 
 
 @dataclass(frozen=True)
 class TrialScene:
     """A scene to train on.
 
-    digest: changes with what ``data`` is made from; of given data it has their place, and files' sizes and times. seed:
-    of the damage to its masks. options: of ``beags-data``, by name, as plain values. sample: what a generated one is
-    made of, which a plan does not write. photos: the scene that its base is trained on; None: itself.
+    digest: changes with the source of ``data``; for the user's data it covers path, sizes and times of files. seed:
+    seed of the damage to masks. options: options of ``beags-data`` by name, as plain values. sample: config of a
+    generated scene, which a plan does not write. photos: the scene that its base is trained on; None for this scene.
     """
 
     name: str
@@ -49,7 +56,7 @@ class TrialScene:
 
     @property
     def unwritten(self) -> SampleConfig | None:
-        """Return what the scene would be made of, if it is not there."""
+        """Return the config of a generated scene that is not on disk; None for others."""
         return None if self.data.exists() else self.sample
 
     def parser(self) -> BeagsDataParserConfig:
@@ -61,26 +68,30 @@ class TrialScene:
 
 @dataclass(frozen=True)
 class SceneSize:
-    """What a scene has to train on: the number of views, and of pixels in all of them, as they are trained on."""
+    """Numbers of training views and of their pixels, at the resolution of training."""
 
     views: int
     pixels: int
 
+    @classmethod
+    def of(cls, outputs: DataparserOutputs) -> SceneSize:
+        """Return the size of the training views that a data parser returned."""
+        cameras = outputs.cameras
+        return cls(len(outputs.image_filenames), int((cameras.width.long() * cameras.height.long()).sum()))
+
 
 def scene_size(scene: TrialScene) -> SceneSize:
-    """Return the size of a scene, read from the disk if it is there; raises ``UserError`` for what cannot be read."""
+    """Return the size of a scene, read from disk if it is there; raises ``UserError`` if it cannot be read."""
     if (sample := scene.unwritten) is not None:
         return SceneSize(sample.num_train, sample.num_train * sample.width * sample.height)
     parser = scene.parser()
     parser.downscale_factor = scene.downscale
-    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
-        outputs = parser.setup().get_dataparser_outputs("train")
-    pixels = outputs.cameras.width.long() * outputs.cameras.height.long()
-    return SceneSize(len(outputs.image_filenames), int(pixels.sum()))
+    with quiet():
+        return SceneSize.of(parser.setup().get_dataparser_outputs("train"))
 
 
 def parser_options(plain: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options of ``beags-data`` with paths in place of their texts."""
+    """Return plain options of ``beags-data`` with their paths as ``Path``."""
     return {name: Path(value) if name.endswith("_path") else value for name, value in plain.items()}
 
 
@@ -119,10 +130,10 @@ def given_scenes(folders: Sequence[Path], downscale: float | None) -> list[Trial
 def damaged_masks(scene: TrialScene, degree: float, folder: Path, write: bool = True) -> Path:
     """Return a folder with the scene's masks, those of the training views damaged to ``degree`` (1 is mild, 2 strong).
 
-    Exact masks (``ground_truth/masks``) are damaged where the scene has them, else its own masks. The scene's seed and
-    the view's name decide the damage. At degree 1 a sample gets its default masks: the damage that its views share
-    comes first, where the experiment generates it. Masks of held-out views stay as they are. An existing folder of the
-    same damage is used again. Without ``write`` the folder is only named.
+    Exact masks (``ground_truth/masks``) are damaged if the scene has them, else its own masks. The scene's seed and the
+    view's name determine the damage. At degree 1 a sample gets its default masks; damage that its views share comes
+    first, if the experiment generates it. Masks of held-out views stay unchanged. An existing folder of the same damage
+    is reused. Without ``write`` only the folder's name is returned.
     """
     from beags_plugin.sample import degrade, shared_damage
 
@@ -132,12 +143,12 @@ def damaged_masks(scene: TrialScene, degree: float, folder: Path, write: bool = 
     if not write or _is_whole(target):
         return target
     parser = scene.parser().setup()
-    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
+    with quiet():
         splits = {split: parser.get_dataparser_outputs(split) for split in ("test", "train")}
     stems = [Path(file).stem for file in splits["train"].image_filenames]
     dropped = degrade.dropped_views(stems, scene.seed, degradation.dropped)
     flawed = _shared_damage(scene.sample)
-    for split, outputs in splits.items():  # a view in both is for training
+    for split, outputs in splits.items():  # the second split, training, overwrites views that are in both
         classes = np.array(sorted(outputs.metadata["classes"]))
         masks = _best_masks(outputs.metadata, split)
         for image, (mask, kind) in zip(outputs.image_filenames, masks, strict=True):
@@ -162,8 +173,9 @@ def damaged_masks(scene: TrialScene, degree: float, folder: Path, write: bool = 
 def class_masks(scene: TrialScene, count: int, folder: Path, write: bool = True) -> Path:
     """Return a folder with masks of ``count`` objects for the training views, to measure what classes cost.
 
-    The objects are cells around seed points: each pixel has that of the nearest point in the picture, whatever hides
-    it. Held-out views have none, so that no quality is scored. Without ``write`` the folder is only named.
+    The objects are cells around seed points: each pixel has the cell of the nearest point in the picture, occluded or
+    not. Held-out views have no masks, so that no quality is scored. Without ``write`` only the folder's name is
+    returned.
     """
     import torch
     from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
@@ -176,7 +188,7 @@ def class_masks(scene: TrialScene, count: int, folder: Path, write: bool = True)
     target = folder / f"classes-{value_digest([scene.digest, count, code])[:12]}"
     if not write or _is_whole(target):
         return target
-    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
+    with quiet():
         outputs = scene.parser().setup().get_dataparser_outputs("train")
     points = outputs.metadata["points3D_xyz"]
     cells = KMeans(count, n_init=1, random_state=0).fit_predict(points.numpy())  # pyright: ignore[reportArgumentType]
@@ -194,7 +206,7 @@ def class_masks(scene: TrialScene, count: int, folder: Path, write: bool = True)
 
 
 def _shared_damage(config: SampleConfig | None) -> Callable[[np.ndarray, np.ndarray, str], np.ndarray] | None:
-    """Return what gives the exact mask of a training view, from its depth and name, the damage that views share."""
+    """Return a function (mask, depth, name) that adds the damage shared by views to an exact mask; None without any."""
     if config is None or not config.shared_damage:
         return None
     from beags_plugin.sample.families import FAMILIES
@@ -208,7 +220,7 @@ def _shared_damage(config: SampleConfig | None) -> Callable[[np.ndarray, np.ndar
 
 
 def _is_whole(target: Path) -> bool:
-    """Return whether a folder of made masks is there; if not, make it empty."""
+    """Return whether a folder of made masks is complete; if not, empty it."""
     if (target / "complete").exists():
         return True
     shutil.rmtree(target, ignore_errors=True)
@@ -218,7 +230,7 @@ def _is_whole(target: Path) -> bool:
 
 
 def _best_masks(metadata: dict[str, Any], split: str) -> list[tuple[Path | None, str]]:
-    """Return each view's mask and its kind: the exact one for a training view that has it, else the given one."""
+    """Return each view's mask and its kind: the exact mask of a training view if there is one, else the given mask."""
     given: list[Path | None] = metadata["mask_filenames"]
     truth = metadata["ground_truth"]
     exact = truth["masks"] if truth and split == "train" else [None] * len(given)

@@ -44,7 +44,7 @@ _COLUMNS = (  # head, figure, digits, factor
 
 
 def tables(experiment: Experiment, rows: Sequence[ResultRow]) -> list[Table | str]:
-    """Return what to print: the means, each scene, the paper's figures, the protocol, and the failures."""
+    """Return the tables and sentences to print: means, scenes, the paper's figures, protocol, failures."""
     averaged = means(rows)
     scenes = list(dict.fromkeys(row.scene for row in rows))
     title = f"{experiment.name}, {experiment.preset}: mean over {', '.join(scenes)}"
@@ -102,7 +102,7 @@ def _any(rows: Sequence[ResultRow], figure: str) -> bool:
 
 
 def per_million_pixels(row: ResultRow, experiment: Experiment) -> str:
-    """Return the place on a sweep's axis per million training pixels, or a dash if the sweep does not ask for it."""
+    """Return the position on a sweep's axis per million training pixels, or a dash for other sweeps."""
     pixels = row.figures["training_pixels"]
     if row.variant.sweep not in experiment.relative_to_pixels or not pixels or row.variant.x is None:
         return "–"
@@ -116,7 +116,7 @@ def _cells(row: ResultRow, columns: Sequence[tuple[str, str, int, float]]) -> li
 
 
 def paper_table(paper: PaperFigures, reference: str | None) -> Table:
-    """Return a table of the paper's own figures, which its title names as such."""
+    """Return a table of the paper's figures, with a title that says so."""
     title = f"For comparison, the paper's figures, not ours: {paper.source}; IoU / BIoU, % (BIoU error left, %)"
     start = paper.rows.get(reference or "")
     rows = []
@@ -130,7 +130,7 @@ def paper_table(paper: PaperFigures, reference: str | None) -> Table:
 
 
 def memory_line(averaged: Sequence[ResultRow], sweep: str) -> str | None:
-    """Return a sentence with the range of memory along a sweep, or None if all of it failed."""
+    """Return a sentence with the range of memory along a sweep; None if all its trials failed."""
     figures = [row.figures for row in averaged if row.variant.sweep == sweep]
     peaks, own = ([v for f in figures if (v := f[name]) is not None] for name in ("peak_memory_mb", "own_memory_mb"))
     if not peaks or not own:

@@ -1,4 +1,4 @@
-"""Trials: one training each, identified by a digest of everything that decides its result."""
+"""Trials: single trainings, each identified by a digest of everything that determines its result."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ OPTIONS = MODEL + "refiner_options"
 
 
 def code_of_trials() -> str:
-    """Digest all code that decides a trial's result: beags, packages that extend it, and what measures here."""
+    """Digest all code that determines a trial's result: beags, packages that extend it, and ``measure``."""
     points = (point for each in distributions() for point in each.entry_points if point.group.startswith("beags."))
     packages = {point.value.partition(":")[0].partition(".")[0] for point in points} - {__name__.partition(".")[0]}
     files = [Path(__file__).with_name("measure.py")]
@@ -33,7 +33,7 @@ def code_of_trials() -> str:
 
 @dataclass(frozen=True)
 class Trial:
-    """One training: of a base, or (with ``base``) of the refinement that starts from that base.
+    """One training: a base or, with ``base``, a refinement that starts from that base.
 
     overrides: dotted config keys and their values. masks: folder that replaces the scene's masks. code: digest of the
     code that runs it.
@@ -49,7 +49,7 @@ class Trial:
 
     @cached_property
     def digest(self) -> str:
-        """Return a digest that trials share if their results are equal; given data that were moved count as others."""
+        """Return a digest that trials with equal results share; user data that were moved count as different."""
         from beags_plugin.plugin.presets import preset_files
 
         return value_digest(
@@ -57,10 +57,10 @@ class Trial:
                 "scene": self.scene.digest,
                 "downscale": self.scene.downscale,
                 "preset": [path.read_text("utf8") for path in preset_files(self.preset)],
-                "overrides": {key: repr(value) for key, value in self.overrides.items()},  # repr: JSON has no infinity
+                "overrides": {key: repr(value) for key, value in self.overrides.items()},  # repr writes infinity too
                 "seed": self.seed,
                 "code": self.code,
-                "masks": self.masks and self.masks.name,  # a digest in itself
+                "masks": self.masks and self.masks.name,  # the name has a digest
                 "base": self.base and self.base.digest,
                 **({"options": dict(self.scene.options)} if self.scene.options else {}),
             }
@@ -77,7 +77,7 @@ class Trial:
 class VariantTrial:
     """The trials of a variant on a scene with a seed: one, or one for each object.
 
-    objects: the names of these objects; empty for a trial of all.
+    objects: names of these objects; empty for one trial of all.
     """
 
     variant: Variant
@@ -88,7 +88,7 @@ class VariantTrial:
 
     @property
     def trial(self) -> Trial:
-        """Return the first of them."""
+        """Return the first trial."""
         return self.trials[0]
 
 
@@ -97,7 +97,7 @@ def plan(
 ) -> list[VariantTrial]:
     """Return every variant on every scene with every seed, scene after scene; variants share bases where they can.
 
-    masks: folder of other masks by scene name and variant. code: digest of the code.
+    masks: (scene name, variant name) to the folder of the variant's own masks. code: digest of the code.
     """
     planned = []
     for scene in scenes:
@@ -116,7 +116,7 @@ def plan(
 
 
 def base_trial(experiment: Experiment, variant: Variant, scene: TrialScene, seed: int, code: str) -> Trial:
-    """Return the training of a variant's base. Masks do not change it: it is trained from photos alone."""
+    """Return the training of a variant's base, which depends on photos but not on masks."""
     changes = {**variant.base, MODEL + "refine_steps": 0}
     return Trial(scene.photos or scene, experiment.preset, changes, seed, code)
 

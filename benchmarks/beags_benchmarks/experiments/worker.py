@@ -1,11 +1,11 @@
-"""Trials, each in a process of its own: ``python -m`` with this module reads their folders, a line each.
+"""The program that runs trials in processes of their own: ``python -m`` with this module reads a folder from each line.
 
-A line says how far to run a trial ("trained" or "scored") and names its folder, which holds trial.json. The worker
-trains into FOLDER/run and writes FOLDER/trained.json, measures and writes FOLDER/result.json, or FOLDER/failed.json
-with the reason in a sentence. What an interrupted attempt has saved there, it does not do again. The output goes to
-FOLDER/log.txt. For each folder the program prints the exit code of the trial's process, which it forks: imports, which
-take longer than a short trial, are done once. Where there may be a GPU, each process is this program anew ("UNTIL
-FOLDER" as arguments): imports start CUDA, which cannot be used after a fork.
+A line has "trained" or "scored", how far to run the trial, and its folder, which holds trial.json. The worker trains
+into FOLDER/run and writes FOLDER/trained.json, then measures and writes FOLDER/result.json. A failure writes
+FOLDER/failed.json with the reason in a sentence. Saved work of an interrupted attempt is not repeated. The output goes
+to FOLDER/log.txt. For each folder the program prints the exit code of the trial's process. This process is forked, so
+that imports, which take longer than a short trial, happen once. If there may be a GPU, each process is a new start of
+this program ("UNTIL FOLDER" as arguments): imports start CUDA, which cannot be used after a fork.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 GPU_FILES = ("/dev/nvidiactl", "/dev/dxg")
-"""Made by the drivers of Linux, and of Linux under Windows."""
+"""Files of the GPU drivers of Linux, and of Linux under Windows."""
 
 
 def serve() -> None:
@@ -44,7 +44,7 @@ def serve() -> None:
 
 
 def _in_program(folder: str, until: str) -> int:
-    """Run the trial in ``folder`` by this program anew; returns the exit code, negative for a signal."""
+    """Run the trial in ``folder`` in a new start of this program; returns the exit code, negative for a signal."""
     command = [sys.executable, "-m", "beags_benchmarks.experiments.worker", until, folder]
     return subprocess.Popen(command, stdin=subprocess.DEVNULL).wait()
 
@@ -59,7 +59,7 @@ def _forked(folder: str, until: str) -> int:
 
 
 def _import_everything() -> None:
-    """Import what a trial needs, but compute nothing: threads would not survive the fork."""
+    """Import what a trial needs without computing anything: threads do not survive the fork."""
     from nerfstudio.scripts import train  # noqa: F401
 
     from beags_benchmarks.experiments import measure  # noqa: F401
@@ -72,7 +72,7 @@ def _import_everything() -> None:
 
 def _in_child(folder: Path, until: str) -> int:
     """Run the trial in ``folder`` with its output in a file; returns the exit code."""
-    end_with_parent()  # the program that waits for the trial
+    end_with_parent()  # the parent is the program that waits for the trial
     code = 1
     try:
         with open(folder / "log.txt", "ab") as log, open(os.devnull) as nothing:
@@ -80,9 +80,9 @@ def _in_child(folder: Path, until: str) -> int:
             os.dup2(log.fileno(), 1)
             os.dup2(log.fileno(), 2)
         code = _trial(folder, until)
-    except KeyboardInterrupt:  # the training has saved itself
+    except KeyboardInterrupt:  # the training has saved its state
         code = INTERRUPTED
-    except BaseException:  # whatever it is must not continue in the loop of the parent
+    except BaseException:  # no error may continue in the loop of the parent
         traceback.print_exc()
     finally:
         sys.stdout.flush()
@@ -104,30 +104,25 @@ def _trial(folder: Path, until: str) -> int:
         elif until == TRAINED:
             return 0
         else:
-            name, content = "result", {**trained, **measure(folder / "run")}
+            from beags_benchmarks.experiments.measure import measure_run
+
+            name, content = "result", {**trained, **measure_run(folder / "run" / "config.yml")}
     except UserError as error:
         name, content = "failed", {"failed": str(error)}
-    except Exception as error:  # whatever goes wrong is a row of the table, and the other trials run
+    except Exception as error:  # any error becomes a row of the table, and the other trials run
         traceback.print_exc()
         name, content = "failed", {"failed": f"{type(error).__name__}: {error}".splitlines()[0]}
     write_text_atomically(json.dumps(content, indent=1), folder / f"{name}.json")
     return int(name == "failed")
 
 
-def measure(run_folder: Path) -> dict[str, Any]:
-    """Return the figures of ``measure.measure_run``."""
-    from beags_benchmarks.experiments.measure import measure_run
-
-    return measure_run(run_folder / "config.yml")
-
-
 def train_trial(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
-    """Train, or go on with a training that was interrupted.
+    """Train, or continue an interrupted training.
 
     Returns {"steps", "gaussians", "seconds": {stage: s}, "cpu_seconds", "peak_memory_mb", "own_memory_mb" (the peak
-    without the loaded program), "processor"}. cpu_seconds is None after an interruption: what was killed has not said
-    how much it took. A refinement adds "summary" (a line per stage), "voxel_size" and "training_pixels", and some
-    refiners a figure of their own, as "labelled_share".
+    without the loaded program), "processor"}. cpu_seconds is None after an interruption, as the share of the killed
+    process is unknown. A refinement adds "summary" (a line for each stage), "voxel_size" and "training_pixels"; some
+    refiners add a figure of their own, such as "labelled_share".
     """
     from beags_plugin.data.files import image_size
     from beags_plugin.plugin.launch import resume, train
@@ -145,7 +140,7 @@ def train_trial(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
         train(config)
     elif not (run_folder / REPORT_FILE).exists():
         resume(run_folder)
-    # CPU time does not grow while other programs have the cores
+    # CPU time does not depend on other programs.
     result: dict[str, Any] = {"cpu_seconds": None if again else time.process_time(), "processor": _processor(config)}
     result |= json.loads((run_folder / REPORT_FILE).read_text())
     result["own_memory_mb"] = result["peak_memory_mb"] - start_memory_mb
@@ -156,7 +151,7 @@ def train_trial(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
     result["steps"] = model.base_steps + refined
     if model.refine_steps == 0:
         return result
-    del result["seconds"]["base training"]  # that of loading one
+    del result["seconds"]["base training"]  # this is the time of loading one
     prepared = run_folder / "prepared"
     result["summary"] = json.loads((prepared / "report.json").read_text())["summary"]
     grid = grid_state(prepared / "grid.pt")
@@ -167,7 +162,7 @@ def train_trial(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
 
 
 def _processor(config: BeagsTrainerConfig) -> str:
-    """Return the name of what computed: others round in another way."""
+    """Return the name of the processor that computed, since processors round differently."""
     import torch
 
     from beags_benchmarks.provenance import describe_machine
@@ -184,7 +179,7 @@ def trial_config(request: dict[str, Any], run_folder: Path) -> BeagsTrainerConfi
     config = preset_config(request["preset"], request["overrides"], Path("trial.json"))
     config.run_dir = run_folder
     config.vis = "tensorboard"
-    config.steps_per_eval_image = 0  # held-out views are for the end
+    config.steps_per_eval_image = 0  # held-out views are scored at the end
     config.machine.seed = request["seed"]
     data = config.data_config
     data.train_cameras_sampling_seed = request["seed"]
@@ -197,7 +192,9 @@ def trial_config(request: dict[str, Any], run_folder: Path) -> BeagsTrainerConfi
     ]  # a variant may shrink the images further
     if request["masks"] is not None:
         parser.masks_path = Path(request["masks"])
-        if (names := parser.masks_path / "classes.json").exists():  # of other objects, which no truth knows
+        if (
+            names := parser.masks_path / "classes.json"
+        ).exists():  # names of other objects, for which there is no truth
             parser.classes_path, parser.ground_truth_path = names, parser.masks_path / "no_truth"
     if request["base"] is not None:
         config.load_dir = Path(request["base"]) / "nerfstudio_models"

@@ -1,1 +1,1 @@
-"""How fast the compiled rasterizer and ops are, on the CPU and on a GPU."""
+"""Speed of the compiled rasterizer and ops on the CPU and on a GPU."""

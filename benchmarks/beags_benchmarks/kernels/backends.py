@@ -1,4 +1,4 @@
-"""Rasterizers over one scene: forward (to images) and backward (to gradients of all inputs)."""
+"""Forward and backward of rasterizers on one scene."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from beags_benchmarks.kernels.clock import Seconds
 from beags_benchmarks.kernels.scenes import OUTPUTS, Scene, surfel_inputs
 from beags_plugin.rasterizers import RASTERIZERS, native
 from beags_plugin.rasterizers.interface import Rasterizer, SurfelInputs
+from beags_plugin.system.memory import available_mb
 
 LEAVES = ("means", "quats", "log_scales", "opacity_logits", "colors", "background")
 
 
 def rasterizer(name: str) -> Rasterizer:
-    """Return a registered rasterizer; the reference keeps within a quarter of the memory that is free."""
+    """Return a registered rasterizer; the reference may take a quarter of the free memory."""
     if name == "torch":
-        return RASTERIZERS.get("torch")(memory_limit=min(4e9, 0.25 * free_bytes()))
+        return RASTERIZERS.get("torch")(memory_limit=min(4e9, 0.25e6 * available_mb()))
     return RASTERIZERS.get(name)()
 
 
@@ -46,7 +47,7 @@ def run(name: str, scene: Scene) -> tuple[Seconds, Seconds, dict[str, Tensor], d
 
 
 class _Loss(torch.autograd.Function):
-    """A number with given gradients: to hand them to autograd itself costs more than a loss does."""
+    """A scalar whose backward has given gradients: passing them to autograd directly costs more time."""
 
     @staticmethod
     def forward(ctx, gradients: list[Tensor], *images: Tensor) -> Tensor:
@@ -64,15 +65,6 @@ def digest(*tensors: Tensor) -> str:
     for tensor in tensors:
         total.update(tensor.detach().contiguous().numpy().tobytes())
     return total.hexdigest()
-
-
-def free_bytes() -> float:
-    """Return the free memory; infinite where the system does not report it."""
-    try:
-        with open("/proc/meminfo") as lines:
-            return next(1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
-    except (OSError, StopIteration):
-        return float("inf")
 
 
 def work_counts(scene: Scene) -> dict[str, int] | None:

@@ -2,8 +2,8 @@
 
     python -m beags_benchmarks.kernels.cuda [--quick | --smoke] [--json FILE] [--seconds 500] [--gsplat-seconds 150]
 
-Figures are medians of CUDA events around whole calls, after warming up. What does not fit into --seconds is left out
-and named. See notes/speed.md.
+Times are medians of CUDA events around whole calls, after warming up. Rows that do not fit into --seconds are left out
+and listed. See notes/speed.md.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from beags_plugin.rasterizers.interface import SurfelInputs
 
 COUNTS = (100_000, 1_000_000, 4_000_000)
 IMAGES = ((832, 608), (1280, 800), (1920, 1088))  # 0.5, 1 and 2 megapixels
-LAYERS = 45  # contributing, per pixel: what 50,000 surfels of 17 pixels give 640 x 480
+LAYERS = 45  # contributing surfels per pixel, as 50,000 surfels of 17 pixels have at 640 x 480
 SAMPLES = (1, 10, 20, 50, 100, 1000)  # Z
 LEAST_WIDTH = 3.0  # pixels
 DEVICE = "cuda"
-PARAMETER_BYTES = 52  # of a surfel: mean, quaternion, two scales, opacity, colour, as float32
-PIXEL_BYTES = 36  # of a pixel: colour, alpha, two depths, normal
-# of a pair: what is written once and read once at least; keys and places before and after the sort, and the record
+PARAMETER_BYTES = 52  # float32 of a surfel: mean, quaternion, two scales, opacity, colour
+PIXEL_BYTES = 36  # float32 of a pixel: colour, alpha, two depths, normal
+# Each pair is written and read at least once: keys and indices before and after the sort, and the record.
 PAIR_BYTES = 2 * (2 * 8 + 4 + 80)
 
 
 def case(count: int, width: int, height: int) -> Size:
-    """Return surfels wide enough that every pixel has about ``LAYERS``, or more where they would be too small."""
+    """Return a size whose surfels give every pixel about ``LAYERS``, or more if they would be too small."""
     return Size(count, width, height, max(LEAST_WIDTH, 17.0 * (50_000 / (640 * 480) * width * height / count) ** 0.5))
 
 
@@ -61,7 +61,7 @@ def milliseconds(call: Callable[[], Any], repeats: int, warm: int = 3) -> float:
 
 
 def peak_mb(call: Callable[[], Any]) -> float:
-    """Return the memory that a call takes from torch's allocator beyond what is held before it."""
+    """Return the peak MB that a call adds to torch's allocator."""
     torch.cuda.synchronize()
     before = torch.cuda.memory_allocated()
     torch.cuda.reset_peak_memory_stats()
@@ -76,7 +76,7 @@ def make_cuda() -> CudaRasterizer:
 
 
 class Rendering:
-    """Forward and backward of one backend over one scene, towards all parameters and colours."""
+    """Forward and backward of one backend on one scene, with gradients of all parameters and colours."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
@@ -119,7 +119,7 @@ class GsplatRendering(Rendering):
 
 
 class GsplatWithoutDepth(GsplatRendering):
-    """gsplat without depth, which renders less than the others."""
+    """gsplat without depth; it renders less than the others."""
 
     mode = "RGB"
 
@@ -128,7 +128,7 @@ BACKENDS = (("beags", Rendering), ("gsplat", GsplatRendering), ("gsplat RGB", Gs
 
 
 def rendering_row(scene: Scene, rendering: Rendering, name: str, repeats: int) -> dict[str, Any]:
-    """Return the times of a backend, and its memory."""
+    """Return the times and the memory of a backend."""
     with torch.no_grad():
         forward = milliseconds(rendering.images, repeats)
     both = milliseconds(rendering.both, repeats)
@@ -141,15 +141,15 @@ def rendering_row(scene: Scene, rendering: Rendering, name: str, repeats: int) -
 
 
 def size_of(size: Size) -> dict[str, Any]:
-    """Return the figures that name a row."""
+    """Return the entries that identify a row."""
     return {"n": size.n, "width": size.width, "height": size.height}
 
 
 def least_bytes(size: Size, pairs: int) -> int:
-    """Return the bytes that forward and backward must move at least.
+    """Return the least number of bytes that forward and backward move.
 
     Parameters are read twice and their gradients written once; images are written and their gradients read; each pair
-    of a tile and a surfel has its share.
+    of a tile and a surfel adds ``PAIR_BYTES``.
     """
     return 3 * PARAMETER_BYTES * size.n + 2 * PIXEL_BYTES * size.width * size.height + PAIR_BYTES * pairs
 
@@ -168,7 +168,7 @@ PROBE = "from gsplat.rendering import rasterization_2dgs; from gsplat.cuda._back
 def gsplat_missing(seconds: float) -> str | None:
     """Return None if gsplat's CUDA kernels can be used, else the reason.
 
-    gsplat compiles them on its first import, which may take many minutes. A process of its own limits this to
+    gsplat compiles them on its first import, which may take many minutes; a separate process limits this to
     ``seconds``.
     """
     if seconds <= 0:
@@ -184,14 +184,14 @@ def gsplat_missing(seconds: float) -> str | None:
 
 
 def copy_rate() -> float:
-    """Return the GB/s of a large copy on the device, bytes read and written: the limit for moving memory."""
+    """Return the GB/s, read and written, of a large copy on the device: the limit of memory transfer."""
     source = torch.rand(1 << 28, device=DEVICE)
     target = torch.empty_like(source)
     return 2 * source.numel() * 4 / milliseconds(lambda: target.copy_(source), 10) / 1e6
 
 
 def step_rows(size: Size, repeats: int) -> list[dict[str, Any]]:
-    """Measure a training step without and with the two losses, Z from 1 to 1000; a row that fails holds the reason."""
+    """Measure a training step without and with the two losses, Z from 1 to 1000; a failed row has the reason."""
     rows: list[dict[str, Any]] = []
     scene: Scene | None = None
     for samples in (None, *SAMPLES):
@@ -211,14 +211,14 @@ def step_rows(size: Size, repeats: int) -> list[dict[str, Any]]:
 
 
 def rendering_rows(size: Size, repeats: int, gsplat: bool) -> list[dict[str, Any]]:
-    """Measure both backends on one scene; a row that fails (without memory, say) holds the reason."""
+    """Measure both backends on one scene; a failed row (out of memory, for example) has the reason."""
     rows: list[dict[str, Any]] = []
     scene: Scene | None = None
     for name, kind in BACKENDS[: None if gsplat else 1]:
         try:
             scene = scene or on_device(make_scene(size), DEVICE)
             rows.append(rendering_row(scene, kind(scene), name, repeats))
-        except Exception as error:  # of another library too: what is measured already must not be lost
+        except Exception as error:  # also errors of other libraries: earlier rows must not be lost
             rows.append({**size_of(size), "backend": name, "failed": failure(error)})
         print(rows[-1], flush=True)
         torch.cuda.empty_cache()
@@ -226,18 +226,18 @@ def rendering_rows(size: Size, repeats: int, gsplat: bool) -> list[dict[str, Any
 
 
 def failure(error: Exception) -> str:
-    """Return the error in a line."""
+    """Return the error in one line."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the benchmark; returns exit code 1 without a GPU, for numbers that are not finite, and if our rows fail."""
+    """Run the benchmark; return exit code 1 without a GPU, for numbers that are not finite, or if our rows fail."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="the smallest sizes only")
     parser.add_argument("--smoke", action="store_true", help="run every kernel once, time nothing")
     parser.add_argument("--json", help="file to write, again after every row")
-    parser.add_argument("--seconds", type=float, default=500.0, help="begin nothing new after so long")
+    parser.add_argument("--seconds", type=float, default=500.0, help="start no new row after this time")
     parser.add_argument("--gsplat-seconds", type=float, default=150.0, help="for gsplat to compile; 0 leaves it out")
     chosen, began = parser.parse_args(arguments), time.monotonic()
     if reason := CudaRasterizer.unavailable():

@@ -1,4 +1,4 @@
-"""Every CUDA kernel once, on a small scene, for a memory checker."""
+"""Run of every CUDA kernel on a small scene, for a memory checker."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings, Surfe
 LEAVES = ("means", "quats", "log_scales", "opacity_logits", "colors")
 SMALL = Size(2_000, 130, 100)
 DEGREES = (0, 1, 2, 3)
-VARIANTS = (  # geometry, distortion, boundary: each has kernels of its own in float32
+VARIANTS = (  # geometry, distortion, boundary; each has its own float32 kernels
     (False, False, False),
     (False, False, True),
     (True, False, False),
@@ -65,7 +65,7 @@ def _results(
     yield "voxel counts", [grid.count(plain.means, ids), grid.valid(plain.means, ids)]
     yield "discs inside", [grid.disc_inside(plain.means, axis_u, axis_v, ids)]
     lookup = grid.lookup()
-    assert lookup is not None  # where there is a rasterizer of CUDA, there is the compiled module
+    assert lookup is not None  # the compiled module has the CUDA rasterizer too
     shape = [inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits]
     loss = occupancy_loss(shape[0], shape[1], shape[2], shape[3], ids, lookup, stream=7, samples=20)
     yield "occupancy loss", [loss, *_gradients(loss, shape)]
@@ -74,7 +74,7 @@ def _results(
 
 
 def _reprojected(rasterizer: Rasterizer, scene: Scene, inputs: SurfelInputs) -> Iterator[Tensor]:
-    """Yield confidences of both kinds, from two views with different depths and masks."""
+    """Yield confidences of both reprojections from two views with different depths and masks."""
     settings, background = replace(scene.settings, geometry=True), scene.background.to(inputs.means.dtype)
     rendered = rasterizer.rasterize(inputs, scene.camera, settings, background)
     depths = [image for image in (rendered.depth, rendered.median_depth) if image is not None]

@@ -1,4 +1,4 @@
-"""The measurements of the rasterizers: workers take turns, case after case, and give one result."""
+"""Measurements of the rasterizers: workers alternate on each case and give one result."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from beags_benchmarks.kernels.worker import Worker
 
 REFINEMENT_SAMPLES = 20  # Z of the preset
 MANY_SAMPLES = 1000
-EMPTY = "1/16x16"  # a step with next to no work: what is left is Python, bindings and dispatch
+EMPTY = "1/16x16"  # a step with almost no work: its time is that of Python, bindings and dispatch
 OVERHEAD_SIZE = SIZES[0]
 STEP_SIZE = SIZES[2]
-RASTERIZER_PARTS = ("rasterizer forward", "rasterizer backward")  # of a step: what the rest is compared with
+RASTERIZER_PARTS = ("rasterizer forward", "rasterizer backward")  # parts of a step with which the rest is compared
 MEASURED_MEMORY = ("native", "torch", "step")
-# Cost of a pixel in one layer, forward and backward, relative to the native rasterizer's: for the time left only.
+# Cost of a pixel in one layer, forward and backward, relative to the native rasterizer; for the time left only.
 _COST = {"native": 1.0, "torch": 80.0}
-LARGEST_SLOW = 100_000  # surfels; larger cases are for the native rasterizer alone
+LARGEST_SLOW = 100_000  # surfels; larger cases are for the native rasterizer only
 
 
 @dataclass
@@ -31,8 +31,8 @@ class Options:
     sizes: list[Size]
     threads: list[int]
     rounds: int
-    seconds: float  # of a round, for one thing
-    budget: float  # seconds of all rounds of one thing
+    seconds: float  # length of one turn
+    budget: float  # seconds of all turns of one entry
     torch: bool = True
     step: bool = True
     memory: tuple[str, ...] = MEASURED_MEMORY
@@ -44,9 +44,9 @@ class Options:
 
 @dataclass
 class Series:
-    """Timings of one thing, milliseconds of wall and CPU time.
+    """Timings of one entry, milliseconds of wall and CPU time.
 
-    With one thread what counts is CPU time, which other programs disturb little; with more it is wall time.
+    CPU time counts with one thread, because other programs hardly change it; with more threads wall time counts.
     """
 
     threads: int
@@ -81,11 +81,11 @@ class Result:
     notes: list[str] = field(default_factory=list)
 
 
-Advance = Callable[[float, str], None]  # (work done, in units of the total; what comes next)
+Advance = Callable[[float, str], None]  # takes work done, in units of the total, and the next entry
 
 
 class Session:
-    """The workers of one run: ``best`` has the best instruction set and all backends, ``others`` one more ISA each."""
+    """The workers of one run: ``best`` has the best instruction set and all backends, ``others`` one other ISA each."""
 
     def __init__(self, stack: ExitStack, options: Options, notes: list[str]) -> None:
         names = ["native", *(["torch"] if options.torch else [])]
@@ -102,14 +102,14 @@ class Session:
             if isa == self.isa:
                 continue
             worker = stack.enter_context(Worker(isa))
-            found = worker.ask("hello", names=["native"])
-            if found["isa"] == isa:
+            answer = worker.ask("hello", names=["native"])
+            if answer["isa"] == isa:
                 self.others[isa] = worker
             else:
-                notes.append(f"not measured: instruction set {isa}, it cannot run here ({found['reasons']['native']})")
+                notes.append(f"not measured: instruction set {isa}, it cannot run here ({answer['reasons']['native']})")
 
     def entries(self, size: Size, options: Options, notes: list[str]) -> Iterator[tuple[str, str | None, int]]:
-        """Yield (backend, isa, threads) of everything that is timed at a size."""
+        """Yield (backend, isa, threads) of every timed entry at a size."""
         for name in self.backends:
             if name == "torch" and size.n > LARGEST_SLOW and not options.torch_large:
                 notes.append(f"not measured: {name} at {size.name}, where a call takes minutes and gigabytes")
@@ -126,12 +126,12 @@ class Session:
 
 
 def work(size: Size) -> float:
-    """Return about the number of pixels times layers."""
+    """Return the approximate number of pixels times layers."""
     return size.n * 0.96 * size.diameter**2
 
 
 def total_work(options: Options) -> float:
-    """Return about the sum of the work that ``advance`` gets, for the time left."""
+    """Return the approximate sum of the work that ``advance`` receives, for the time left."""
     kinds = 4 + _COST["torch"] * options.torch
     cases = sum(work(size) * (kinds if size.n <= LARGEST_SLOW else 4) for size in options.sizes)
     return cases * len(options.threads) * 2 + work(options.step_size) * 100 * options.step
@@ -179,7 +179,7 @@ def measure_sizes(session: Session, options: Options, result: Result, advance: A
 def _interleave(
     session: Session, size: Size, entries: list, options: Options, advance: Advance
 ) -> dict[Any, dict[str, Series]]:
-    """Run rounds in which every entry has its turn; a slow one drops out when its budget is spent."""
+    """Run rounds in which every entry has a turn; a slow entry stops when its budget is spent."""
     timed = {entry: {stage: Series(entry[2]) for stage in ("forward", "backward")} for entry in entries}
     spent = dict.fromkeys(entries, 0.0)
     for turn in range(options.rounds):
@@ -198,7 +198,7 @@ def _interleave(
 
 
 def _peak(size: Size, entry, session: Session, options: Options, notes: list[str], advance: Advance) -> float | None:
-    """Return the memory of the best instruction set and the first number of threads; the others take the same."""
+    """Return the peak memory for the best instruction set and the first number of threads; others need the same."""
     backend, isa, threads = entry
     if backend not in options.memory or isa not in (None, session.isa) or threads != options.threads[0]:
         return None
@@ -207,7 +207,7 @@ def _peak(size: Size, entry, session: Session, options: Options, notes: list[str
 
 
 def peak_in_new_process(notes: list[str], what: str, **arguments: Any) -> float | None:
-    """Return the MB, or None and a note if the process failed."""
+    """Return the peak MB; None and a note if the process failed."""
     try:
         with Worker() as worker:
             return worker.ask("peak", **arguments)
@@ -217,7 +217,7 @@ def peak_in_new_process(notes: list[str], what: str, **arguments: Any) -> float 
 
 
 def _add_stages(session: Session, size: Size, options: Options, scene: dict[str, Any]) -> None:
-    """Return {"projection_binning_ms", "same_bits"}; same_bits: 1, 2 and 4 threads give the same bits."""
+    """Add "projection_binning_ms" and "same_bits", whether 1, 2 and 4 threads give the same bits, to ``scene``."""
     threads = options.threads[0]
     frame = session.best.ask("stages", size=size.name, threads=threads, seconds=options.seconds)
     scene["projection_binning_ms"] = Series(threads, frame).best
@@ -226,7 +226,7 @@ def _add_stages(session: Session, size: Size, options: Options, scene: dict[str,
 
 
 def measure_step(session: Session, options: Options, result: Result, advance: Advance) -> None:
-    """Fill ``step``: whole steps, their parts, refinement, overhead and memory; see the keys below."""
+    """Fill ``step`` with whole steps, their parts, refinement, overhead and memory."""
     if "native" not in session.backends:
         result.notes.append("not measured: training steps, the native rasterizer is missing")
         return

@@ -1,4 +1,4 @@
-"""The peak memory of a call beyond the memory that the process holds before it."""
+"""Peak memory that a call adds to its process."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from pathlib import Path
 def peak_mb_of(call: Callable[[], object]) -> float:
     """Return the MB (2^20 bytes) of resident memory that ``call`` adds at its peak.
 
-    On Linux the kernel's high-water mark is reset first: the one that getrusage reports keeps what imports once took,
-    and what the parent process held when it started this one, and would hide a small case. Elsewhere it is getrusage's.
+    On Linux the kernel's high-water mark is reset first. That of getrusage, used on other systems, includes imports and
+    the parent process at its start, which would hide a small case.
     """
     gc.collect()
     _give_back_free_memory()
@@ -42,6 +42,6 @@ def _most_so_far() -> int:
 
 
 def _give_back_free_memory() -> None:
-    """Return free memory to the system, so that a call cannot use memory that the C library kept."""
+    """Return free memory to the system, so that a call cannot reuse memory that the C library still holds."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)

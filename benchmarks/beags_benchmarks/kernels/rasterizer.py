@@ -38,11 +38,11 @@ class Arguments:
     threads: tuple[int, ...] = (1, 2)
     """Numbers of threads."""
     rounds: int = 7
-    """Rounds in which everything has its turn."""
+    """Rounds in which every entry has a turn."""
     seconds: float = 0.3
-    """Length of a turn; a slower call takes one turn."""
+    """Length of a turn in seconds; a longer call is one turn."""
     budget: float = 20.0
-    """Seconds after which a slow backend takes no more turns at a size; it always has one."""
+    """Seconds after which a slow backend has no more turns at a size; it always has one."""
     torch: bool = True
     """Measure the torch reference (never at 200k, see torch-large)."""
     torch_large: bool = False
@@ -57,7 +57,7 @@ class Arguments:
     """File to write everything to."""
 
     def options(self) -> Options:
-        """Return the things to measure; raises ``UserError`` for a size or number that cannot be."""
+        """Return the options of the measurement; raises ``UserError`` for an invalid size or number."""
         if self.quick:
             small = parse_size(QUICK_SIZE)
             return Options(
@@ -73,7 +73,7 @@ class Arguments:
 
 
 def main(arguments: list[str]) -> None:
-    """Measure, print, write."""
+    """Measure, print the tables and write the file."""
     chosen = tyro.cli(Arguments, args=arguments)
     console = Console(width=None if sys.stdout.isatty() else 140)
     try:

@@ -114,7 +114,7 @@ def _print_step(step: dict[str, Any], console: Console) -> None:
 
 
 def outside_share(step: dict[str, Any], kind: str) -> float:
-    """Share of a step's time that its rasterizer does not take."""
+    """Return the share of a step's time outside of its rasterizer."""
     own = sum(step["parts_ms"][kind][part] for part in RASTERIZER_PARTS)
     return max(0.0, 1.0 - own / step["whole_ms"][kind])
 

@@ -1,4 +1,4 @@
-"""Scenes to measure: seeded clouds of surfels of a stated width on the screen, in front of one camera."""
+"""Scenes for measurements: seeded clouds of surfels of a given width on the screen, in front of one camera."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from beags_plugin.system.errors import UserError
 
 OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion", "boundary")
 CLASSES = 4  # 0, the background, and three objects
-SLANT = 0.3  # of the borders between classes: image widths per image height
+SLANT = 0.3  # slant of the borders between classes: image widths per image height
 NEAREST, FARTHEST = 2.0, 6.0  # depth range of the centres, world units
-SIGMA_PER_RADIUS = 0.468  # standard deviation over half the screen box, as measured at these opacities and slants
-MARGIN = 0.03  # the cloud reaches over the image's border by this share of its size, so that borders are covered too
+SIGMA_PER_RADIUS = 0.468  # standard deviation over half the screen box, measured at these opacities and slants
+MARGIN = 0.03  # share of the image's size by which the cloud exceeds its border, so that borders are covered
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Scene:
 
     surfels: N, with spherical harmonics of degree 3. class_ids: [N] int32. colors: [N, 3].
     target: [H, W] int32, a class map of the same classes. image: [H, W, 3], a picture to compare with.
-    gradients: one random image for each float output of ``RasterOutputs``, by name: what the backward starts from.
+    gradients: one random image for each float output of ``RasterOutputs``, by name, from which the backward starts.
     """
 
     size: Size
@@ -82,7 +82,7 @@ class Scene:
 
 
 def make_scene(size: Size, seed: int = 0) -> Scene:
-    """Make surfels of random place, slant and opacity; the same for the same size and seed."""
+    """Return surfels of random position, slant and opacity, determined by size and seed."""
     g = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
@@ -90,13 +90,13 @@ def make_scene(size: Size, seed: int = 0) -> Scene:
 
     n, width, height = size.n, size.width, size.height
     focal = 0.9 * width
-    # Drawn evenly over the image and its depth, so that every pixel has about the same layers.
+    # Positions are uniform over the image and its depth, so that every pixel has about the same number of layers.
     across = uniform(n, low=-MARGIN, high=1 + MARGIN) * width
     down = uniform(n, low=-MARGIN, high=1 + MARGIN) * height
     depth = uniform(n, low=NEAREST, high=FARTHEST)
     means = torch.stack([(across - width / 2) * depth / focal, (down - height / 2) * depth / focal, depth], dim=-1)
     sigma = size.diameter / 2 * SIGMA_PER_RADIUS * depth / focal
-    sizes = 0.45 * torch.randn(n, 1, generator=g)  # a few surfels are large, as in trained scenes
+    sizes = 0.45 * torch.randn(n, 1, generator=g)  # as in trained scenes, a few surfels are large
     log_scales = sigma.log()[:, None] + sizes + 0.25 * torch.randn(n, 2, generator=g)
     camera = Camera(
         torch.eye(4), torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]), width, height

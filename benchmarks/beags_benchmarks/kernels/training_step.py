@@ -20,7 +20,7 @@ from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, SurfelInputs
 from beags_plugin.rasterizers.rendering import surfel_inputs
 
-VOXELS_PER_SPACING = 0.6  # voxel size over the mean spacing of the surfels: a fifth of them take samples
+VOXELS_PER_SPACING = 0.6  # voxel size over the mean spacing of surfels, at which a fifth of them are sampled
 _OUTPUTS = ("color", "alpha", "depth", "normal", "boundary")  # inputs of the losses
 
 
@@ -28,14 +28,16 @@ class TrainingStep:
     """The step of the preset ``beags-paper`` on one scene: L1 + SSIM and normal losses; in refinement two more.
 
     samples: Z of the occupancy loss, in a refinement step with boundary and occupancy losses; None: a base step.
-    rasterizer: None for the best one here.
+    rasterizer: the best available one if None.
     """
 
     def __init__(self, scene: Scene, samples: int | None = None, rasterizer: Rasterizer | None = None) -> None:
         surfels = {field.name: getattr(scene.surfels, field.name) for field in fields(Surfels)}
         self.parameters = {name: torch.nn.Parameter(value.clone().contiguous()) for name, value in surfels.items()}
         groups = [{"params": [value]} for value in self.parameters.values()]
-        self.adam = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)  # all the work, and every step the same
+        self.adam = torch.optim.Adam(
+            groups, lr=0.0, eps=1e-15, fused=True
+        )  # with a rate of 0 all steps do the same work
         self.step = 0
         self.scene = scene
         self.rasterizer = rasterizer or make_rasterizer("auto")
@@ -49,21 +51,21 @@ class TrainingStep:
         self.grid = visibility_grid(scene) if self.refining else None
 
     def run(self) -> Seconds:
-        """Run a step; returns its time."""
+        """Run a step and return its time."""
         start = Seconds.now()
         self.adam.zero_grad()
         surfels = Surfels(**self.parameters)
         class_ids = self.scene.class_ids if self.refining else None
         render = self._rasterize(surfel_inputs(surfels, self.scene.camera, class_ids=class_ids))
         inputs = self._loss_inputs(surfels, render)
-        # as nerfstudio adds them up
+        # The sum has the order of nerfstudio.
         reduce(torch.add, [loss.weighted(inputs) for loss in self.losses.values()]).backward()
         self.adam.step()
         self.step += 1
         return Seconds.now() - start
 
     def run_parts(self) -> dict[str, Seconds]:
-        """Run a step with its graph cut between the parts; returns the time of each, a loss forward and backward."""
+        """Run a step with its graph cut between parts; return the time of each; a loss's has forward and backward."""
         seconds: dict[str, Seconds] = {}
         clock = Seconds.now()
 
@@ -101,7 +103,7 @@ class TrainingStep:
         return seconds
 
     def sampled_share(self) -> float:
-        """Return the share of surfels outside valid voxels at least in part, which the occupancy loss samples."""
+        """Return the share of surfels that lie partly outside valid voxels, which the occupancy loss samples."""
         from beags_plugin.losses import occupancy
 
         if self.grid is None or not hasattr(occupancy, "_outside"):

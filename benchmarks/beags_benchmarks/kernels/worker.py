@@ -1,7 +1,7 @@
-"""A process that measures on request: one JSON request a line in, one JSON answer a line out.
+"""A process that measures on request: it reads JSON requests and writes JSON answers, one in each line.
 
-The instruction set is chosen once a process (environment variable BEAGS_ISA), so each one needs a process of its own;
-peak memory needs a fresh process for each case.
+A process chooses its instruction set once (environment variable BEAGS_ISA), so each set needs its own process; peak
+memory needs a new process for each case.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 from beags_benchmarks.provenance import with_these_packages
 
 Timings = list[tuple[float, float]]  # milliseconds of wall and CPU time, one pair a call
-MAX_CALLS = 40  # of one thing in one round
+MAX_CALLS = 40  # most calls of one entry in one round
 SMALL = "64/32x32"  # a case that only loads code and starts threads
 
 
@@ -29,7 +29,7 @@ class Worker:
     def __init__(self, isa: str | None = None) -> None:
         environment = with_these_packages(os.environ)
         environment.pop("BEAGS_ISA", None)
-        # Idle threads that spin would take the cores from the process whose turn it is.
+        # Spinning idle threads would take cores from the process that is measured.
         environment.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         if isa is not None:
             environment["BEAGS_ISA"] = isa
@@ -39,7 +39,7 @@ class Worker:
         )  # fmt: skip
 
     def ask(self, do: str, **arguments: Any) -> Any:
-        """Return the answer; raises ``RuntimeError`` with the worker's own message, or if it died."""
+        """Send a request and return the answer; raises ``RuntimeError`` with the worker's error, or if it ended."""
         assert self._process.stdin is not None and self._process.stdout is not None
         try:
             print(json.dumps({"do": do, **arguments}), file=self._process.stdin, flush=True)
@@ -68,7 +68,7 @@ class Worker:
 
 def main() -> None:
     """Answer until the input ends."""
-    # What a library prints must not get between the answers.
+    # Output of libraries goes to stderr, so that it does not mix with the answers.
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     for line in sys.stdin:
@@ -91,7 +91,7 @@ def _hello(names: list[str]) -> dict[str, Any]:
     known = reasons.get("native", "") is None
     for name, reason in reasons.items():
         if reason is None:
-            backends.run(name, _scene(SMALL))  # what a process pays once
+            backends.run(name, _scene(SMALL))  # costs that occur once in a process
     return {
         "torch": torch.__version__,
         "reasons": reasons,
@@ -106,41 +106,41 @@ def _time(size: str, backend: str, threads: int, seconds: float) -> dict[str, Ti
 
     _set_threads(threads)
     scene = _scene(size)
-    found: dict[str, Timings] = {"forward": [], "backward": []}
+    timings: dict[str, Timings] = {"forward": [], "backward": []}
     for _ in _calls(seconds):
         forward, backward, _, _ = backends.run(backend, scene)
-        found["forward"].append(forward.ms())
-        found["backward"].append(backward.ms())
-    return found
+        timings["forward"].append(forward.ms())
+        timings["backward"].append(backward.ms())
+    return timings
 
 
 def _stages(size: str, threads: int, seconds: float) -> Timings:
-    """Measure the native forward's first stage alone: projection and binning."""
+    """Measure only the first stage of the native forward: projection and binning."""
     from beags_benchmarks.kernels import backends
     from beags_benchmarks.kernels.clock import Seconds
     from beags_plugin.rasterizers import native
 
     _set_threads(threads)
     scene = _scene(size)
-    inputs, found = backends.surfel_inputs(scene), []
+    inputs, timings = backends.surfel_inputs(scene), []
     for _ in _calls(seconds):
         start = Seconds.now()
         native._frame(inputs, scene.camera, scene.settings)
-        found.append((Seconds.now() - start).ms())
-    return found
+        timings.append((Seconds.now() - start).ms())
+    return timings
 
 
 def _step(
     size: str, threads: int, seconds: float, samples: int | None = None, parts: bool = False
 ) -> dict[str, Timings]:
-    """Whole training steps ("step"), or a step's parts."""
+    """Measure whole training steps ("step"), or the parts of steps."""
     _set_threads(threads)
     step = _training_step(size, samples)
-    found: dict[str, Timings] = {}
+    timings: dict[str, Timings] = {}
     for _ in _calls(seconds):
         for name, value in (step.run_parts() if parts else {"step": step.run()}).items():
-            found.setdefault(name, []).append(value.ms())
-    return found
+            timings.setdefault(name, []).append(value.ms())
+    return timings
 
 
 def _digest(size: str, threads: int) -> str:
@@ -174,7 +174,7 @@ def _peak(size: str, threads: int, backend: str | None = None, samples: int | No
     if backend is None:
         TrainingStep(_scene(SMALL), samples).run()
         step = _training_step(size, samples)
-        step.run()  # Adam's moments are the scene's, not the step's
+        step.run()  # Adam's moments belong to the scene, not to the step
         return peak_mb_of(step.run)
     scene = _scene(size)
     backends.run(backend, _scene(SMALL))
@@ -182,7 +182,7 @@ def _peak(size: str, threads: int, backend: str | None = None, samples: int | No
 
 
 def _calls(seconds: float):
-    """Yield the number of each call until the time is over, at least one."""
+    """Yield the number of each call until the time is over, at least once."""
     end = time.perf_counter() + seconds
     gc.collect()
     for call in range(MAX_CALLS):

@@ -1,1 +1,1 @@
-"""Programs that measure one thing each: README.md of this distribution lists them."""
+"""Single programs for measurements; README.md of this distribution lists them."""

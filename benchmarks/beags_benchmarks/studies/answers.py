@@ -1,8 +1,8 @@
-"""Time how soon the commands answer: a mistake is to be refused within 2 s, and something shown within 3 s.
+"""Time the answers of commands: the goals are 2 s for refusing a mistake and 3 s for the first output.
 
-Commands on a finished run are to begin their work within 3 s of CPU, and files of the demo to take no more than
-``EXPORTS`` says. Seconds of CPU are those of the process and its children: a busy machine hardly changes them. Every
-command runs in a terminal of its own (a pty), as a user has one, after one start that fills the file cache.
+Commands on a finished run should begin their work within 3 s of CPU, and exports of the demo should need no more than
+``EXPORTS``. CPU seconds are those of the process and its children, which a busy machine hardly changes. Every command
+runs in its own terminal (a pty), after one start that fills the file cache.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ REFUSED, SHOWN = 2.0, 3.0  # seconds, the goals
 BEGUN = 3.0  # seconds of CPU until a command on a finished run begins its work
 _UNSEEN = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|starting|[\s⠀-⣿]")  # codes of terminals, and the spinner of the start
 
-MISTAKES = {  # refused at once
+MISTAKES = {  # commands that must be refused at once
     "beags masks check --data nowhere": "",
     "beags masks make --data {tmp} --source grabcat": "",
     "beags extract --load-config absent.yml": "",
@@ -35,7 +35,7 @@ MISTAKES = {  # refused at once
     "beags doctor --data nowhere": "",
     "ns-train beags-tiny --data nowhere": "",
 }
-WORK = {  # shows at once that it has begun
+WORK = {  # commands that must show at once that they have begun
     "beags --help": "",
     "beags doctor": "",
     "beags masks check --data {data} --output {tmp}/check": "data",
@@ -45,12 +45,12 @@ WORK = {  # shows at once that it has begun
     "beags eval --load-config {run}": "run",
     "ns-train beags --help": "",
 }
-EXPORTS = {  # of the demo, to seconds of CPU
+EXPORTS = {  # exports of the demo, to seconds of CPU
     "beags export --load-config {run} --object {object} --format ply --output {tmp}/ply": 4.0,
     "beags export --load-config {run} --object {object} --format glb --output {tmp}/glb": 10.0,
     "beags export --load-config {run} --all --format ply glb --output {tmp}/all": 60.0,
 }
-OF_RUNS = {  # begin their work within ``BEGUN``
+OF_RUNS = {  # commands that must begin their work within ``BEGUN``
     "beags masks reproject --load-config {run} --output {tmp}/reprojected": "run",
     "beags masks check --load-config {run} --output {tmp}/checked": "run",
     **{command: "run" for command, needs in WORK.items() if needs == "run"},
@@ -62,7 +62,7 @@ OF_RUNS = {  # begin their work within ``BEGUN``
 class Answer:
     """Seconds until the first visible character, and until the end; the command's exit code.
 
-    begun: seconds of CPU until it has shown more than that it starts. cpu: until the end.
+    begun: seconds of CPU until the first output after the start message. cpu: until the end.
     """
 
     command: str
@@ -97,13 +97,13 @@ def answer(command: str, words: list[str]) -> Answer:
 
 
 def _cpu_of(process: int) -> float:
-    """Return the seconds of CPU that a process has taken so far; Linux alone tells."""
+    """Return the CPU seconds of a process so far; on Linux only."""
     words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def main() -> None:
-    """Print a line per command: the least seconds of all rounds, and whether the goal is met."""
+    """Print a line for each command: the least seconds of all rounds, and whether the goal is met."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--run", type=Path, help="a trained run, for the commands that need one")
     parser.add_argument("--data", type=Path, help="a scene, for the commands that need one")

@@ -1,6 +1,6 @@
 """README's curve of CPU seconds against extracted BIoU: ``python -m beags_benchmarks.studies.cost_curve``.
 
-It is drawn from the files of docs/results that README's table is made from, and from those of the trade-off.
+Its data are the files of docs/results behind README's table.
 """
 
 from __future__ import annotations

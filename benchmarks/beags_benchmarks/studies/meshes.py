@@ -1,13 +1,13 @@
 """Meshes of trained runs against photos and exact shapes: python -m beags_benchmarks.studies.meshes RUN [OBJECT ...].
 
-For each object (all, if none is named) of a run: its mesh with a texture, with colours of vertices, and closed; drawn
-by four rays a pixel into the held-out views. PSNR is over the pixels well inside the object's masks (of generated
-scenes, which are exact) that mesh and splats both cover, its mean over views; covered is the share of the masks' pixels
-that the mesh covers. Chamfer is the mean of the two mean distances between mesh and exact surface, the underside too,
-in per cent of the object's longest side; it is not a number for captures, whose shapes nobody knows.
+Each object (all, if none is named) of a run is exported as a mesh with a texture, with colours of vertices, and closed,
+and rendered into the held-out views by four rays a pixel. PSNR is the mean over views, over pixels well inside the
+object's masks (exact in generated scenes) that both mesh and splats cover. Covered is the share of the masks' pixels
+that the mesh covers. Chamfer is the mean of the two mean distances between mesh and exact surface, including the
+underside, in per cent of the object's longest side; it is nan for captures, whose shapes are unknown.
 
-With ``--one-colour``: PSNR of the splats alone, as they are and with one colour from all sides, which is
-what any texture can be compared with where the photos' colours change with the view.
+With ``--one-colour``: PSNR of the splats alone, unchanged and with one colour from all sides. The latter is the bound
+for textures where the photos' colours change with the view.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
+from beags_plugin.evaluation.metrics import psnr
 from beags_plugin.export import EXPORTERS
 from beags_plugin.export.mesh import GlbExporter
 
-FEWEST = 50  # pixels of a view that are scored at least
-RAYS, DISTANCES = 200_000, 20_000  # at the exact surface; of points on meshes
+FEWEST = 50  # pixels that a scored view needs
+RAYS, DISTANCES = 200_000, 20_000  # rays at the exact surface, and points on a mesh
 _TYPES = {5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A .glb read back: places [V, 3], z up, faces [F, 3]; sRGB colours by vertex [V, 3] or by uv [V, 2] and image."""
+    """A mesh of a .glb: places [V, 3], z up, faces [F, 3]; sRGB colours by vertex [V, 3] or by uv [V, 2] and image."""
 
     places: np.ndarray
     faces: np.ndarray
@@ -52,7 +53,7 @@ class Drawn:
         return scene
 
     def seen_by(self, camera, to_run: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the picture [H, W, 3] and which pixels the mesh covers [H, W], by 2 x 2 rays for each."""
+        """Return the picture [H, W, 3] and the pixels that the mesh covers [H, W], by 2 x 2 rays for each pixel."""
         import open3d
 
         from beags_plugin.core.cameras import Camera
@@ -82,7 +83,7 @@ class Drawn:
 
 
 def looked_up(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Return the picture's colours [P, 3] at uv [P, 2], between texels."""
+    """Return the picture's colours [P, 3] at uv [P, 2], interpolated between texels."""
     from scipy.ndimage import map_coordinates
 
     at = (uv * [image.shape[1], image.shape[0]] - 0.5)[:, ::-1].T
@@ -90,7 +91,7 @@ def looked_up(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 def read_glb(path: Path) -> Drawn:
-    """Read what ``beags export`` wrote, by the standard."""
+    """Read a .glb of ``beags export`` by the standard."""
     from PIL import Image
 
     from beags_plugin.surfaces.color import srgb_from_linear
@@ -117,13 +118,8 @@ def read_glb(path: Path) -> Drawn:
     return Drawn(places, faces, None, accessor(named["TEXCOORD_0"]).astype(np.float64), image)
 
 
-def psnr(first: np.ndarray, second: np.ndarray) -> float:
-    """Return the PSNR in dB of values 0..1."""
-    return float(-10 * np.log10(max(np.mean((first - second) ** 2), 1e-12)))
-
-
 def exact_points(thing) -> np.ndarray:
-    """Return points [P, 3] spread over the whole exact surface of an object of a generated scene, world."""
+    """Return points [P, 3] over the whole exact surface of an object of a generated scene, world."""
     generator = np.random.default_rng(0)
     ways = generator.normal(size=(RAYS, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -137,7 +133,7 @@ def exact_points(thing) -> np.ndarray:
 
 
 def chamfer(mesh: Drawn, exact: np.ndarray) -> float:
-    """Return the mean of both mean distances, in per cent of the longest side of the exact points [P, 3]."""
+    """Return the mean of both mean distances in per cent of the longest side of the exact points [P, 3]."""
     import open3d
     import trimesh
     from scipy.spatial import KDTree
@@ -152,7 +148,7 @@ def chamfer(mesh: Drawn, exact: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class VertexColors(GlbExporter):
-    """As glb, without a texture; an exporter of its own, so that one export makes the depth of an object once."""
+    """A glb without texture; a separate exporter, so that one export renders the depth of an object once."""
 
     suffix: ClassVar[str] = "colors.glb"
     texture: Any = "none"
@@ -160,7 +156,7 @@ class VertexColors(GlbExporter):
 
 @dataclass(frozen=True)
 class Closed(GlbExporter):
-    """As glb, closed."""
+    """A closed glb."""
 
     suffix: ClassVar[str] = "closed.glb"
     closes: ClassVar[bool] = True
@@ -170,7 +166,7 @@ VARIANTS = {"glb": "texture", "glb-colors": "vertex colours", "glb-closed": "tex
 
 
 def measure(config_path: Path, objects: Sequence[str]) -> None:
-    """Print rows of a table for objects of a run, all if none is named."""
+    """Print rows of a table for objects of a run, or for all if none is named."""
     from beags_plugin.core.select import select_class
     from beags_plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.objects.export import export_run
@@ -204,7 +200,7 @@ def measure(config_path: Path, objects: Sequence[str]) -> None:
 
 
 def measure_one_colour(config_path: Path, objects: Sequence[str]) -> None:
-    """Print PSNR of objects' splats in held-out views, as they are and with one colour each."""
+    """Print PSNR of objects' splats in held-out views, unchanged and with one colour each."""
     from beags_plugin.core.select import select_class
     from beags_plugin.export.page_colors import seen_colors
     from beags_plugin.objects.evaluate import EvaluatedRun
@@ -227,8 +223,8 @@ def measure_one_colour(config_path: Path, objects: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class Scored:
-    """A held-out view: its photo [H, W, 3], the pixels well inside an object's exact mask [H, W], and the object's
-    splats, drawn alone: colours [H, W, 3] and where they are [H, W]."""
+    """A held-out view: photo [H, W, 3], pixels well inside an object's exact mask [H, W], and the object's splats
+    rendered alone: colours [H, W, 3] and solid pixels [H, W]."""
 
     camera: Any
     photo: np.ndarray
@@ -238,7 +234,7 @@ class Scored:
 
 
 def scored(run, part, view, class_id: int) -> Scored:
-    """Return what a held-out view tells of an object; part: its Gaussians."""
+    """Return the data of a held-out view for an object; part: its Gaussians."""
     from scipy.ndimage import binary_erosion
 
     from beags_plugin.labels.class_ids import resize_nearest
@@ -254,7 +250,7 @@ def scored(run, part, view, class_id: int) -> Scored:
 
 
 def figures(mesh: Drawn, to_run: np.ndarray, views: Sequence[Scored], exact: np.ndarray | None) -> list[float]:
-    """Return a mesh's row but for the size of its file; exact: points of the true surface, None if it is unknown."""
+    """Return a mesh's row without the size of its file; exact: points of the true surface, None if it is unknown."""
     mine, theirs, covered, of = [], [], 0, 0
     for view in views:
         picture, there = mesh.seen_by(view.camera, to_run)
@@ -270,7 +266,7 @@ def figures(mesh: Drawn, to_run: np.ndarray, views: Sequence[Scored], exact: np.
 
 
 def is_closed(mesh: Drawn) -> bool:
-    """Return whether every edge is of two faces, once vertices at one place (of seams) are joined."""
+    """Return whether every edge has two faces, after joining vertices at one place (seams)."""
     import trimesh
 
     return bool(trimesh.Trimesh(mesh.places, mesh.faces, process=True, merge_tex=True, merge_norm=True).is_watertight)
@@ -283,7 +279,7 @@ def formatted(row) -> str:
 
 
 def main() -> None:
-    """Measure objects of the run that is named."""
+    """Measure objects of a run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("objects", nargs="*", metavar="OBJECT")

@@ -1,8 +1,8 @@
 """Tables of README, pages and notes: ``python -m beags_benchmarks.studies.page_tables [captures.json ...]``.
 
 Each given result of ``beags bench`` is reduced to its means, the extracted BIoU of each object, protocol, command,
-commit and machine in docs/results. Then every table of ``TABLES`` is written anew between its two marks, from the files
-there, which are the only source of its figures.
+commit and machine in docs/results. Then every table of ``TABLES`` is rewritten between its two marks from these files,
+which are the only source of its numbers.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from beags_benchmarks.experiments.results import MEAN
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.whole_files import write_text_atomically
 
-ROOT = Path(__file__).resolve().parents[3]  # The pages of this clone are written.
+ROOT = Path(__file__).resolve().parents[3]  # this clone, whose pages are written
 END = "<!-- end of the table -->\n"
 MOST_ROWS = 8
 
 Figure = tuple[str, int, float]
-"""Its name in a row, digits, factor."""
+"""Name in a row, digits, factor."""
 BIOU: Figure = ("extracted_biou_after", 1, 100.0)
 SPILL: Figure = ("extracted_spill_after", 1, 100.0)
 RENDERED: Figure = ("rendered_biou_after", 1, 100.0)
@@ -36,15 +36,15 @@ ALL_SECONDS: Figure = ("cpu_seconds total", 0, 1.0)
 BEAR, DIGGER = "bear, salient", "kitchen, salient"
 
 Column = tuple[str, str, Figure]
-"""File of docs/results, without ".json"; the scene there; the figure of that scene."""
+"""File of docs/results without ".json", scene in that file, figure of the scene."""
 
 
 @dataclass(frozen=True)
 class PageTable:
     """A table of one page: a line for each row of a result, a column for each figure of a scene.
 
-    page: path below the root. name: in its marks. corner: the first cell, which names the scene of all columns, or
-    nothing. columns: by their headings, one figure a cell. rows: names of the results' rows.
+    page: path below the root. name: name in its marks. corner: the first cell, the scene of all columns or "".
+    columns: heading to column, with one number in each cell. rows: names of the results' rows.
     """
 
     page: str
@@ -55,7 +55,7 @@ class PageTable:
 
     @property
     def begin(self) -> str:
-        """Return the mark before the table, a line."""
+        """Return the line before the table."""
         return f"<!-- table {self.name}, made by python -m beags_benchmarks.studies.page_tables -->\n"
 
 
@@ -64,7 +64,7 @@ def _of_scene(file: str, scene: str, figures: Mapping[str, Figure]) -> dict[str,
 
 
 CAPTURES = {"bear, 400 pixels": ("captures-bear", BEAR), "digger, 480 pixels": ("captures-kitchen", DIGGER)}
-"""File and scene of the captures that README shows, by the names they have there and in its curve."""
+"""Name in README and its curve to file and scene of a capture."""
 _ALL = {
     "BIoU, %": BIOU,
     "spill, %": SPILL,
@@ -160,7 +160,7 @@ TABLES: tuple[PageTable, ...] = (
     ),
 )
 _SOURCE = ("experiment", "preset", "reference", "command", "commit", "machine", "torch", "busy", "quick", "protocol")
-_KEPT = (
+_METRICS = (
     "extracted_iou_after",
     "extracted_biou_after",
     "worst_biou_after",
@@ -177,7 +177,7 @@ _OF_OBJECTS = "extracted_biou_after"
 
 
 def reduced(report: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what is kept of a result of ``beags bench``: its source, means, and the means of each scene.
+    """Return the reduced result of ``beags bench``: its source, means, and the means of each scene.
 
     Each row of a scene has "objects", {name: extracted BIoU, or None}, where the result has rows of objects.
     """
@@ -186,11 +186,10 @@ def reduced(report: Mapping[str, Any]) -> dict[str, Any]:
         if (name := line.get("object", MEAN)) != MEAN:
             value = line[_OF_OBJECTS]
             objects.setdefault(_place(line), {})[name] = None if value is None else round(value, 4)
-    kept = (*_ROW, *_KEPT)
 
     def row(full: Mapping[str, Any]) -> dict[str, Any]:
-        found = {name: full[name] for name in kept if full.get(name) is not None}
-        return {name: round(value, 6) if isinstance(value, float) else value for name, value in found.items()}
+        values = {name: full[name] for name in (*_ROW, *_METRICS) if full.get(name) is not None}
+        return {name: round(value, 6) if isinstance(value, float) else value for name, value in values.items()}
 
     source = {name: report[name] for name in _SOURCE if name in report}
     if "command" in source:
@@ -207,7 +206,7 @@ def reduced(report: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _without_places(command: str) -> str:
-    """Return a command without ``--output`` and the folders of its data, which are the machine's own."""
+    """Return a command without ``--output`` and the folders of its data, which belong to the machine."""
     return re.sub(r"(?<=\s)/\S*/(?=[^/\s])", "", re.sub(r"\s--output\s+\S+", "", command))
 
 
@@ -216,7 +215,7 @@ def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def lines_of(table: PageTable, folder: Path) -> str:
-    """Return a table in Markdown, from the files of ``folder``; raises ``UserError`` for what lacks."""
+    """Return a table in Markdown from the files of ``folder``; raises ``UserError`` for missing rows."""
     lines = [[table.corner, *table.columns], ["---"] * (1 + len(table.columns))]
     for name in table.rows:
         cells = []
@@ -235,7 +234,7 @@ def _row_of(path: Path, name: str, scene: str) -> Mapping[str, Any]:
 
 
 def write_tables(root: Path = ROOT) -> None:
-    """Write every table anew into its page; raises ``UserError`` for a page that lacks its marks."""
+    """Rewrite every table in its page; raises ``UserError`` for a page without its marks."""
     for table in TABLES:
         page = root / table.page
         before, begin, rest = page.read_text().partition(table.begin)
@@ -249,7 +248,7 @@ def write_tables(root: Path = ROOT) -> None:
 
 
 def main(arguments: Sequence[str], root: Path = ROOT) -> None:
-    """Reduce the named results into docs/results, and write all tables."""
+    """Reduce the given results into docs/results and write all tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", nargs="*", metavar="[NAME=]FILE", help="NAME: of the file in docs/results")
     for argument in parser.parse_args(arguments).results:
@@ -257,7 +256,7 @@ def main(arguments: Sequence[str], root: Path = ROOT) -> None:
         path = Path(file)
         report = json.loads(path.read_text())
         if report.get("quick"):
-            raise UserError(f"{path} is of --quick, whose figures mean nothing: run the experiment whole.")
+            raise UserError(f"{path} is of --quick, whose figures mean nothing: run the whole experiment.")
         write_json(root / "docs" / "results" / f"{name or path.stem}.json", reduced(report))
     write_tables(root)
 

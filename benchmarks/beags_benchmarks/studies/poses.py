@@ -2,8 +2,8 @@
 
     python -m beags_benchmarks.studies.poses DATA OUTPUT [--every N]
 
-The given poses are hidden: the photos alone go to ``OUTPUT``. After a similarity transform of the camera centres, the
-errors of rotation (degrees) and position (share of the extent: the largest distance of a camera from their middle).
+Only the photos, without the given poses, go to ``OUTPUT``. The camera centres are aligned by a similarity transform;
+then errors of rotation (degrees) and position (share of the largest distance of a camera from the middle) are printed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from beags_plugin.system.whole_files import write_text_atomically
 
 
 def given_poses(data: Path) -> dict[str, np.ndarray]:
-    """Return camera-to-world [4, 4], looking along -z, of each photo by the stem of its file."""
+    """Return camera-to-world [4, 4], looking along -z, of each photo, by the stem of its file."""
     if (file := data / "transforms.json").is_file():
         frames = json.loads(file.read_text())["frames"]
         return {Path(frame["file_path"]).stem: np.array(frame["transform_matrix"]) for frame in frames}
@@ -37,7 +37,7 @@ def given_poses(data: Path) -> dict[str, np.ndarray]:
 
 
 def errors(found: dict[str, np.ndarray], given: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the errors of rotation (degrees) and position (share of the extent) of the photos that both place."""
+    """Return the errors of rotation (degrees) and position (share of the extent) of the photos with both poses."""
     names = sorted(found.keys() & given.keys())
     ours, theirs = (np.stack([poses[name] for name in names]) for poses in (found, given))
     a, b = ours[:, :3, 3], theirs[:, :3, 3]
@@ -48,17 +48,17 @@ def errors(found: dict[str, np.ndarray], given: dict[str, np.ndarray]) -> tuple[
     scale = (s * np.diag(sign)).sum() / np.square(a - a.mean(0)).sum()
     moved = scale * (a - a.mean(0)) @ turn.T + middle
     extent = np.linalg.norm(b - middle, axis=1).max()
-    left = np.einsum("ij,njk,nlk->nil", turn, ours[:, :3, :3], theirs[:, :3, :3])
-    cosine = np.clip((np.trace(left, axis1=1, axis2=2) - 1) / 2, -1, 1)
+    residual = np.einsum("ij,njk,nlk->nil", turn, ours[:, :3, :3], theirs[:, :3, :3])
+    cosine = np.clip((np.trace(residual, axis1=1, axis2=2) - 1) / 2, -1, 1)
     return np.rad2deg(np.arccos(cosine)), np.linalg.norm(moved - b, axis=1) / extent
 
 
 def main() -> None:
-    """Find poses, compare them, print a line and write OUTPUT/errors.json; last are each stage's processor seconds."""
+    """Find poses, compare them, and write the errors and the CPU seconds of each stage to OUTPUT/errors.json."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("output", type=Path)
-    parser.add_argument("--every", type=int, default=1, help="take every N-th photo alone")
+    parser.add_argument("--every", type=int, default=1, help="take only every N-th photo")
     options = parser.parse_args()
     data = options.data
     if options.every > 1:

@@ -1,9 +1,9 @@
-"""Pictures per second of nerfstudio's viewer while the camera moves: its server and a client, without a browser.
+"""Measure the pictures per second of nerfstudio's viewer while the camera moves, by a client without a browser.
 
     python -m beags_benchmarks.studies.viewer [--load-config CONFIG] [--gaussians N] [--seconds 10] [--isolate] [--cut]
 
-Twice: with the sizes of pictures that nerfstudio chooses, and with ours. With --cut, both while objects are picked
-without a pause, as the tab Pick does it.
+It measures twice: with the picture sizes that nerfstudio chooses, and with ours. With --cut, objects are picked without
+a pause meanwhile, as in the tab Pick.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from typing import Any, cast
 from beags_benchmarks.kernels.scenes import Size, make_scene
 from beags_benchmarks.provenance import busy_note, describe_machine
 
-MOVES_PER_SECOND = 50  # what viser's page sends at most
-SETTLING = 4.0  # seconds of moving before the figures count
-WORLD = 10.0  # viser's units in one of nerfstudio's
+MOVES_PER_SECOND = 50  # most messages that viser's page sends
+SETTLING = 4.0  # seconds of motion before pictures count
+WORLD = 10.0  # viser's units per unit of nerfstudio
 
 
 def move_and_count(port: int, middle: list[float], seconds: float, heights: Any) -> None:
@@ -94,7 +94,7 @@ def write_run_of(count: int, root: Path) -> Path:
     parser.data, parser.orientation_method, parser.center_method = root, "none", "none"
     parser.auto_scale_poses, parser.scale_factor = False, 1.0
     state = {
-        # from a camera's axes to z up; the discs are slanted at random anyway
+        # The means turn from a camera's axes to z up; the discs have random slants anyway.
         "gauss_params.means": surfels.means[:, [0, 2, 1]] * torch.tensor([1.0, 1.0, -1.0]),
         "gauss_params.quats": surfels.quats, "gauss_params.scales": surfels.log_scales,
         "gauss_params.opacities": surfels.opacity_logits[:, None], "gauss_params.features_dc": surfels.sh_dc,
@@ -106,7 +106,7 @@ def write_run_of(count: int, root: Path) -> Path:
 
 
 class Stages:
-    """Seconds spent in functions that are wrapped in place."""
+    """Records the seconds spent in wrapped functions."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
@@ -125,7 +125,7 @@ class Stages:
 
 
 def measure(viewer: Any, port: int, middle: list[float], seconds: float, ours: bool, stages: Stages) -> float:
-    """Move for a while, print what came, and return the pictures per second."""
+    """Move for a while, print the received pictures, and return their number per second."""
     from beags_plugin.plugin.viewer.pace import Pace
 
     viewer.pipeline.model.viewing.pace = Pace()
@@ -156,9 +156,9 @@ def measure(viewer: Any, port: int, middle: list[float], seconds: float, ours: b
 
 
 def cut_on(viewing: Any, seconds: list[float]) -> None:
-    """Cut an object out of the shown scene again and again, in a thread, and show it in colour as the tab Pick does.
+    """Cut an object out of the shown scene repeatedly, in a thread, and show it in colour like the tab Pick.
 
-    A mark lies on it, another beside it. seconds: receives how long each cut took.
+    One mark lies on it, another beside it. seconds: receives the time of each cut.
     """
     import torch
 
@@ -185,7 +185,7 @@ def cut_on(viewing: Any, seconds: list[float]) -> None:
         members = cutter.solve(marks).to(colors.device)
         viewing.paint = Paint(colors, 0.65 * members.float(), None)
 
-    cut()  # here, so that an error is seen
+    cut()  # a first cut in this thread shows errors
 
     def work() -> None:
         while True:
@@ -197,7 +197,7 @@ def cut_on(viewing: Any, seconds: list[float]) -> None:
 
 
 def main() -> None:
-    """Print the figures."""
+    """Measure and print the rates."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--load-config", type=Path, help="a run instead of the synthetic scene")
     parser.add_argument("--gaussians", type=int, default=84_000, help="of the synthetic scene")
@@ -205,7 +205,7 @@ def main() -> None:
     parser.add_argument("--isolate", action="store_true", help="show one object alone")
     parser.add_argument("--cut", action="store_true", help="pick objects meanwhile")
     options = parser.parse_args()
-    from nerfstudio.utils.eval_utils import eval_setup  # first, or nerfstudio's imports go round in a circle
+    from nerfstudio.utils.eval_utils import eval_setup  # must come first: nerfstudio's imports are circular otherwise
 
     # isort: split
     from nerfstudio.utils import writer

@@ -95,7 +95,7 @@ def test_engines_are_chosen_by_name_before_anything_is_made(tmp_path, monkeypatc
     path = written(tmp_path, GOOD)
     for options, sentence in {
         ("locale", None): r"there is no engine 'locale' \(did you mean local\?\): choose one of local, ray\.",
-        ("local", "auto"): "--address auto is of a cluster: add --engine ray, or leave it out.",
+        ("local", "auto"): "--address auto names a cluster: add --engine ray, or leave it out.",
     }.items():
         engine, address = options
         with pytest.raises(UserError, match=sentence):

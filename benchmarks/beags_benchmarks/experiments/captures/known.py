@@ -1,23 +1,21 @@
-"""The captures: what each holds, which masks it can be trained on, and which of them are on disk."""
+"""The captures: their objects, the masks that they can be trained on, and those on disk."""
 
 from __future__ import annotations
 
-import contextlib
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from beags_benchmarks.experiments.captures.options import CapturesOptions
 from beags_benchmarks.experiments.experiment import FILES
-from beags_benchmarks.experiments.scenes import SceneSize, TrialScene
+from beags_benchmarks.experiments.scenes import SceneSize, TrialScene, quiet
 from beags_plugin.data.files import image_size, list_images, same_proportions
 from beags_plugin.system.digests import folder_digest
 from beags_plugin.system.errors import UserError, check_choice
 
 GIVEN, PICKED, SALIENT = "given", "picked", "salient"
 KINDS = (GIVEN, PICKED, SALIENT)
-"""Masks of the capture's own folder; cut from the base by committed clicks; what a network finds to stand out."""
+"""Kinds of masks: from the capture's folder; cut from the base by committed clicks; salient objects by a network."""
 QUICK_SIZE = 130  # pixels of a photo's longer side
 LEAST_SIZE = 16
 
@@ -26,8 +24,8 @@ LEAST_SIZE = 16
 class Capture:
     """One capture.
 
-    name: of its folder. masks: the kinds that it is trained on. objects: whose silhouettes were traced. own_truth:
-    whether its given masks are exact and its objects never hidden, so that these masks are the truth.
+    name: name of its folder. masks: kinds of masks that it is trained on. objects: objects with traced silhouettes.
+    own_truth: whether its given masks are the truth, because they are exact and its objects are never occluded.
     """
 
     name: str
@@ -37,7 +35,7 @@ class Capture:
 
     @property
     def prompts(self) -> Path:
-        """Return the file of the clicks by which its objects are picked."""
+        """Return the file with the clicks that pick its objects."""
         return FILES / "captures" / "prompts" / f"{self.name}.json"
 
 
@@ -47,15 +45,15 @@ CAPTURES = (
     Capture("garden", (PICKED,), ("vase", "table")),
     Capture("fruit", (GIVEN,), ("apple", "banana")),
     Capture("dtu_skull", (GIVEN, SALIENT), own_truth=True),
-    Capture("figurine", (SALIENT,)),  # It and fern have no truth and serve pictures.
+    Capture("figurine", (SALIENT,)),  # figurine and fern have no truth and are for pictures
     Capture("fern", (PICKED,)),
 )
-"""The network marks one object, so it serves the captures of one."""
+"""The network marks one object, so only captures of one object have salient masks."""
 
 
 @dataclass(frozen=True)
 class FoundCapture:
-    """A capture on disk. photos: the scene that its bases are trained on. size: of that. truth: folder, or None."""
+    """A capture on disk. photos: scene for bases. size: size of ``photos``. truth: folder of silhouettes, or None."""
 
     capture: Capture
     photos: TrialScene
@@ -64,7 +62,7 @@ class FoundCapture:
 
 
 def find_captures(options: CapturesOptions) -> tuple[list[FoundCapture], list[str]]:
-    """Return the wanted captures that are on disk, and a sentence for each that is not, or lacks its truth.
+    """Return the requested captures on disk, and a sentence for each that is missing or lacks its truth.
 
     Raises ``UserError`` for an option that cannot be used, and if no capture is left.
     """
@@ -107,15 +105,14 @@ def _check(options: CapturesOptions) -> None:
 
 def _found(capture: Capture, folder: Path, options: CapturesOptions) -> tuple[FoundCapture, list[str]]:
     parser = TrialScene(capture.name, folder.resolve(), 1.0, "").parser()
-    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
+    with quiet():
         opened = parser.setup()
         _, views = opened.posed_views()
         longest = max(max(image_size(image)) for image in views.images)
         parser.downscale_factor = max(1.0, longest / (min(options.size, QUICK_SIZE) if options.quick else options.size))
         made = parser.setup()
         training, held_out = (made.get_dataparser_outputs(split) for split in ("train", "test"))
-    cameras = training.cameras
-    size = SceneSize(len(training.image_filenames), int((cameras.width.long() * cameras.height.long()).sum()))
+    size = SceneSize.of(training)
     photos = TrialScene(capture.name, folder.resolve(), parser.downscale_factor, folder_digest(folder))
     if not capture.objects or options.truth is None:
         return FoundCapture(capture, photos, size, None), []
@@ -125,7 +122,7 @@ def _found(capture: Capture, folder: Path, options: CapturesOptions) -> tuple[Fo
 
 
 def _truth_notes(capture: Capture, truth: Path, held_out: Mapping[str, Path]) -> list[str]:
-    """Return sentences about silhouettes that are missing, or of no held-out photo. held_out: photos by their stems.
+    """Return sentences about silhouettes that are missing or have no held-out photo. held_out: photos by their stems.
 
     Raises ``UserError`` for a silhouette with other proportions than its photo.
     """
@@ -154,7 +151,7 @@ def _truth_notes(capture: Capture, truth: Path, held_out: Mapping[str, Path]) ->
 
 
 def kinds_of(found: Sequence[FoundCapture], options: CapturesOptions) -> list[tuple[FoundCapture, str]]:
-    """Return every capture with each kind of masks that is wanted and has its own; raises ``UserError`` for none."""
+    """Return every capture with each requested kind of masks that it has; raises ``UserError`` if there is none."""
     pairs = [
         (each, kind) for each in found for kind in each.capture.masks if not options.masks or kind in options.masks
     ]

@@ -1,26 +1,24 @@
-"""The masks that captures are trained on: found by the network, or cut from a base; made once, beside the trials."""
+"""Masks for training on captures, by the network or cut from a base; they are made once, beside the trials."""
 
 from __future__ import annotations
 
-import contextlib
-import io
 import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
 from beags_benchmarks.experiments.captures.known import PICKED, SALIENT, FoundCapture
-from beags_benchmarks.experiments.scenes import TrialScene
+from beags_benchmarks.experiments.scenes import TrialScene, quiet
 from beags_benchmarks.experiments.trials import Trial
 from beags_plugin.system.digests import folder_digest, value_digest
 from beags_plugin.system.errors import UserError, writing
 
-KEPT = 8  # folders of masks of one kind of a capture; older ones are removed
+KEPT = 8  # folders of masks of one kind of a capture that stay; older ones are removed
 COMPLETE = "complete"
 
 
 def salient_unavailable(fetch: bool) -> str | None:
-    """Return a sentence on why the network cannot mark anything here, or None; fetch: its weights, if missing."""
+    """Return a sentence on why the network cannot run here, or None; fetch: download missing weights."""
     from beags_plugin.masks.sources.salient import SalientSource, fetch_weights
 
     if reason := SalientSource.unavailable():
@@ -34,9 +32,9 @@ def salient_unavailable(fetch: bool) -> str | None:
 
 
 def masked_scene(found: FoundCapture, kind: str, base: Trial, output: Path) -> TrialScene:
-    """Return a capture with masks of a kind, which need not be there yet; nothing is written.
+    """Return a capture with masks of a kind, which need not exist yet; writes nothing.
 
-    base: from which objects are picked. output: folder of the experiment.
+    base: training from which objects are picked. output: folder of the experiment.
     """
     masks = masks_folder(found, kind, base, output)
     options = {} if masks is None else {"masks_path": str(masks / "masks"), "classes_path": str(masks / "classes.json")}
@@ -51,7 +49,7 @@ def masked_scene(found: FoundCapture, kind: str, base: Trial, output: Path) -> T
 
 
 def masks_folder(found: FoundCapture, kind: str, base: Trial, output: Path) -> Path | None:
-    """Return the folder of made masks, named after all that decides them; None for those of the capture's own."""
+    """Return the folder of made masks, whose name has a digest of all inputs; None for the capture's own masks."""
     from beags_plugin.masks.sources import grabcut, salient
 
     if kind == SALIENT:
@@ -65,9 +63,9 @@ def masks_folder(found: FoundCapture, kind: str, base: Trial, output: Path) -> P
 
 
 def truth_links(found: FoundCapture, kind: str, output: Path) -> list[Path]:
-    """Return the links to a capture's truth, in a folder laid out as ``ground_truth``; none if its own serves.
+    """Return the links to a capture's truth in a folder like ``ground_truth``; none if the capture has that folder.
 
-    Nothing hides an object whose silhouette was traced, so that it is the visible mask too.
+    Objects with traced silhouettes are never occluded, so that a silhouette is also the visible mask.
     """
     if found.truth is not None:
         source, names = found.truth, ("silhouettes", "visible")
@@ -80,7 +78,7 @@ def truth_links(found: FoundCapture, kind: str, output: Path) -> list[Path]:
 
 
 def link_truth(found: FoundCapture, kind: str, output: Path) -> None:
-    """Make the links to a capture's truth, unless they are there: nothing is copied."""
+    """Make missing links to a capture's truth; nothing is copied."""
     for link in truth_links(found, kind, output):
         if not link.is_symlink():
             with writing(link):
@@ -89,9 +87,9 @@ def link_truth(found: FoundCapture, kind: str, output: Path) -> None:
 
 
 def make_masks_once(found: FoundCapture, kind: str, folder: Path, run: Path | None) -> list[str]:
-    """Make the masks of a capture in ``folder`` unless they are there; return lines on what was made.
+    """Make the masks of a capture in ``folder`` unless they exist; return lines on the result.
 
-    run: config.yml of the base from which objects are picked. Raises ``UserError`` where none can be made.
+    run: config.yml of the base from which objects are picked. Raises ``UserError`` if no masks can be made.
     """
     from beags_plugin.masks.sources.cut import CutSource
     from beags_plugin.masks.sources.salient import SalientSource
@@ -102,7 +100,7 @@ def make_masks_once(found: FoundCapture, kind: str, folder: Path, run: Path | No
         return []
     source = SalientSource() if kind == SALIENT else CutSource(found.capture.prompts.absolute())
     shutil.rmtree(folder, ignore_errors=True)
-    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
+    with quiet():
         lines = make_masks(found.photos.parser(), source, run, folder, overwrite=True)
     with writing(folder):
         (folder / COMPLETE).touch()

@@ -17,7 +17,7 @@ class CapturesOptions(EngineOptions):
     data_root: Path
     """Folder that holds the captures' folders: bear, kitchen, garden, fruit, dtu_skull, figurine, fern."""
     truth: Path | None = None
-    """Folder of traced silhouettes, <capture>/<object>/<photo>.png: 255 the object, 0 not, 128 cannot be told."""
+    """Folder of traced silhouettes, <capture>/<object>/<photo>.png: 255 object, 0 other, 128 unknown."""
     scenes: tuple[str, ...] = ()
     """Which captures, by name; all if left out."""
     masks: tuple[str, ...] = ()
@@ -25,11 +25,11 @@ class CapturesOptions(EngineOptions):
     rows: Path | None = None
     """A TOML file of other rows, like files/captures/rows.toml."""
     variants: tuple[str, ...] = ()
-    """Which rows, besides the one that is compared with; all if left out."""
+    """Which rows, besides the reference; all if left out."""
     preset: str | None = None
-    """What to train the base with: a preset of method_configs/; that of the rows if left out."""
+    """Preset of method_configs/ for the base; that of the rows if left out."""
     size: int = 800
-    """Most pixels of a photo's longer side; larger photos are divided."""
+    """Most pixels of a photo's longer side; larger photos are scaled down."""
     quick: bool = False
     """Try it out: the first capture, photos of 130 pixels, few steps, figures that mean nothing."""
     output: Annotated[Path, OUTPUT] = Path("outputs/captures")

@@ -1,4 +1,4 @@
-"""A sheet of one capture: a held-out photo, its render by each row, and each object alone from all around."""
+"""A sheet of one capture: a held-out photo, its render by each row, and each object alone from all sides."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ if TYPE_CHECKING:
 SIDE = 200  # pixels of a picture of an object, and height of one of the scene
 AROUND, ABOVE = 4, 20.0  # pictures on a circle, degrees above the horizon
 BENEATH, BELOW = 2, -35.0
-STRAYS = 0.03  # share of an object's Gaussians at each end of each axis that are left out of the picture
-MARGIN = 0.1  # space around the others, in sides of their box
-LETTER = 7  # pixels of one in a caption, at most
+STRAYS = 0.03  # share of an object's Gaussians left out of the picture at each end of each axis
+MARGIN = 0.1  # margin around the others, in sides of their box
+LETTER = 7  # largest width of a letter of a caption, pixels
 
 
 def write_sheet(path: Path, runs: Sequence[VariantTrial], outcomes: Mapping[str, Outcome]) -> bool:
     """Write the sheet of one scene, a line for each row of its first seed; returns whether any row has a result.
 
-    All rows are seen by the same cameras: an object's box is the median of those that it has in the rows.
+    All rows have the same cameras: an object's box is the median of its boxes in the rows.
     """
     from beags_plugin.objects.evaluate import EvaluatedRun
-    from beags_plugin.pictures.cells import below, beside, cell, write_picture
+    from beags_plugin.pictures.cells import as_bytes, below, beside, cell, write_picture
     from beags_plugin.pictures.objects import render_alone
     from beags_plugin.runs.read import read_run
 
@@ -52,7 +52,7 @@ def write_sheet(path: Path, runs: Sequence[VariantTrial], outcomes: Mapping[str,
     assert view.image is not None
     settings = replace(first.settings, geometry=False, distortion=False)
     size = max(1, round(SIDE * view.camera.width / view.camera.height)), SIDE
-    photo = (view.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    photo = as_bytes(view.image)
     stands = {class_id: _stand(class_id, first, scenes) for class_id in first.classes if class_id != 0}
     for name, scene in scenes.items():
         render = render_alone(scene.surfels(), view.camera, settings, first.rasterizer, "black")
@@ -95,9 +95,9 @@ def _stand(class_id: int, first: EvaluatedRun, scenes: Mapping[str, SavedScene])
 
 
 def _bulk(surfels: Surfels) -> tuple[Tensor, Tensor]:
-    """Return the corners, [3] float64 each, of a box around all but the outermost centres, and a margin.
+    """Return the corners, [3] float64 each, of a box with a margin around all but the outermost centres.
 
-    What spreads further leaves the picture: a few strays would else make everything small.
+    Strays may leave the picture; otherwise a few of them would make everything small.
     """
     shares = torch.tensor([STRAYS, 1.0 - STRAYS], dtype=torch.float64)
     low, high = torch.quantile(surfels.means.detach().cpu().double(), shares, dim=0)

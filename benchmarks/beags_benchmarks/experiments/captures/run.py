@@ -6,8 +6,6 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from beags_benchmarks.experiments.captures import made_masks
 from beags_benchmarks.experiments.captures.known import PICKED, SALIENT, FoundCapture, find_captures, kinds_of
 from beags_benchmarks.experiments.captures.options import CapturesOptions
@@ -19,7 +17,7 @@ from beags_benchmarks.experiments.forecast import Forecast
 from beags_benchmarks.experiments.options import ExperimentOptions
 from beags_benchmarks.experiments.report import provenance, write_csv, write_json
 from beags_benchmarks.experiments.results import ResultRow, flat, make_row, report_json, table_rows
-from beags_benchmarks.experiments.run import TABLE_WIDTH, adapted, print_plan, processors, rows_of, trained
+from beags_benchmarks.experiments.run import CONSOLE, adapted, print_plan, print_tables, processors, rows_of, trained
 from beags_benchmarks.experiments.runner import run_trials
 from beags_benchmarks.experiments.scenes import TrialScene
 from beags_benchmarks.experiments.trials import Trial, VariantTrial, base_trial, code_of_trials, plan, steps_of
@@ -27,12 +25,10 @@ from beags_benchmarks.provenance import busy_note
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import progress_bar
 
-CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-
 
 @dataclasses.dataclass(frozen=True)
 class MaskedCapture:
-    """A capture with masks of one kind. scene: with these masks. base: of the photos, from which objects are picked."""
+    """A capture with masks of one kind. scene: has these masks. base: training from which objects are picked."""
 
     found: FoundCapture
     kind: str
@@ -41,7 +37,7 @@ class MaskedCapture:
 
 
 def run_captures(options: CapturesOptions) -> list[ResultRow]:
-    """Train what is not done on every capture that is on disk, print the tables, write files and pictures.
+    """Run the trials that are not done on every capture on disk, print the tables, write files and pictures.
 
     Returns the rows; none with ``options.plan``, which writes nothing. Raises ``UserError`` for a mistake in the
     options. A trial that fails is a row with the reason.
@@ -52,7 +48,7 @@ def run_captures(options: CapturesOptions) -> list[ResultRow]:
         CONSOLE.print(line)
     captures = _with_masks(experiment, found, options)
     source = provenance()
-    busy = busy_note(int(source["machine"]["cores"]))  # before the trials: they keep the machine busy
+    busy = busy_note(int(source["machine"]["cores"]))  # read before the trials, which keep the machine busy
     with open_engine(options) as engine:
         runs = plan(experiment, [each.scene for each in captures], {}, code_of_trials())
         folder = options.output / "trials"
@@ -65,9 +61,7 @@ def run_captures(options: CapturesOptions) -> list[ResultRow]:
         possible = [run for run in runs if run.scene.name not in failed]
         outcomes = trained(possible, folder, engine, forecast)
     rows = _rows(runs, outcomes, failed)
-    wide = Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
-    for table in tables(rows):
-        (CONSOLE if isinstance(table, str) else wide).print(table)
+    print_tables(tables(rows))
     about = {**source, "busy": busy, "quick": options.quick, "size": options.size, "processors": processors(outcomes)}
     files = {kind: getattr(options, kind) or options.output / f"captures.{kind}" for kind in ("json", "csv")}
     write_json(files["json"], {**report_json(experiment, rows, about), "groups": _groups(rows)})
@@ -78,7 +72,7 @@ def run_captures(options: CapturesOptions) -> list[ResultRow]:
 
 
 def _experiment(options: CapturesOptions) -> Experiment:
-    """Return the rows, as the options want them."""
+    """Return the experiment of the rows, adapted to the options."""
     file = options.rows or FILES / "captures" / "rows.toml"
     wanted = ExperimentOptions(preset=options.preset, variants=options.variants, quick=options.quick)
     experiment = adapted(load_experiment(str(file)), wanted)
@@ -90,7 +84,7 @@ def _experiment(options: CapturesOptions) -> Experiment:
 
 
 def _with_masks(experiment: Experiment, found: Sequence[FoundCapture], options: CapturesOptions) -> list[MaskedCapture]:
-    """Return the captures with each kind of masks, but those that nothing can make here, which a sentence says."""
+    """Return the captures with each kind of masks; prints a sentence if salient masks cannot be made here."""
     pairs, code = kinds_of(found, options), code_of_trials()
     if any(kind == SALIENT for _, kind in pairs):
         reason = made_masks.salient_unavailable(fetch=not options.plan)
@@ -110,7 +104,7 @@ def _with_masks(experiment: Experiment, found: Sequence[FoundCapture], options: 
 
 
 def _make_masks(captures: Sequence[MaskedCapture], output: Path, engine: Engine, forecast: Forecast) -> dict[str, str]:
-    """Make masks and link truths that are not there yet; returns the reason by scene where no masks can be made."""
+    """Make missing masks and link truths; returns scene to reason where no masks can be made."""
     bases = [each.base for each in captures if each.kind == PICKED]
     with progress_bar("Training bases to pick from, in steps") as progress:
         outcomes = run_trials(bases, output / "trials", steps_of, engine, progress, forecast.needs) if bases else {}
@@ -145,7 +139,7 @@ def _rows(runs: Sequence[VariantTrial], outcomes: dict[str, Outcome], failed: Ma
 
 
 def _groups(rows: Sequence[ResultRow]) -> dict[str, dict[str, object]]:
-    """Return, by kind of masks, {"scenes", "means": [row with "psnr_cost"]}, as the tables of means."""
+    """Return kind of masks to {"scenes", "means": [row with "psnr_cost"]}, the content of the tables of means."""
     report = {}
     for title, names in groups(list(dict.fromkeys(row.scene for row in rows))).items():
         averaged = mean_rows(rows, names)

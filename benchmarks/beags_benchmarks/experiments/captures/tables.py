@@ -30,7 +30,7 @@ _SCORED = {capture.name for capture in CAPTURES if capture.objects or capture.ow
 
 
 def tables(rows: Sequence[ResultRow]) -> list[Table | str]:
-    """Return what to print: means over the captures that are scored, by kind of masks; each capture; what it means."""
+    """Return the tables: means over the scored captures by kind of masks, each capture, and the legend."""
     scenes = list(dict.fromkeys(row.scene for row in rows))
     printed: list[Table | str] = []
     for title, names in groups(scenes).items():
@@ -47,11 +47,11 @@ def tables(rows: Sequence[ResultRow]) -> list[Table | str]:
 
 
 def groups(scenes: Sequence[str]) -> dict[str, list[str]]:
-    """Return the scored scenes by what their masks are made of; a group of none is left out."""
+    """Return the scored scenes by kind of masks; empty groups are left out."""
     scored = [scene for scene in scenes if scene.split(", ")[0] in _SCORED]
     salient = [scene for scene in scored if scene.endswith(f", {SALIENT}")]
     best = [scene for scene in scored if scene not in salient]
-    return {title: found for title, found in (("best masks", best), ("masks from photos alone", salient)) if found}
+    return {title: names for title, names in (("best masks", best), ("masks from photos alone", salient)) if names}
 
 
 def mean_rows(rows: Sequence[ResultRow], scenes: Sequence[str]) -> list[ResultRow]:
@@ -60,9 +60,9 @@ def mean_rows(rows: Sequence[ResultRow], scenes: Sequence[str]) -> list[ResultRo
 
 
 def psnr_cost(row: ResultRow, rows: Sequence[ResultRow]) -> float | None:
-    """Return the fitted PSNR of a row's control in the same scene minus the row's own, dB; None where unknown.
+    """Return the fitted PSNR of a row's control in the same scene minus the row's own, dB; None if unknown.
 
-    Means over different numbers of scenes have none: they do not compare.
+    Means over different numbers of scenes are not compared.
     """
     same = (row.scene, row.seed, row.count)
     of_control = (

@@ -24,9 +24,9 @@ ENGINES = Registry(
 
 
 def make_engine(name: str, address: str | None = None) -> Engine:
-    """Return the engine called ``name``; raises ``UserError`` for an unknown one, and one that cannot run here.
+    """Return the engine called ``name``; raises ``UserError`` for an unknown engine or one that cannot run here.
 
-    address: of the cluster, for engines that have one.
+    address: address of the cluster, for engines that have one.
     """
     kind = ENGINES.get(name)
     if reason := kind.unavailable():
@@ -36,9 +36,9 @@ def make_engine(name: str, address: str | None = None) -> Engine:
 
 @contextmanager
 def open_engine(options: EngineOptions) -> Iterator[Engine]:
-    """Open the engine of the options, and close it at the end; for a plan nothing is opened.
+    """Open the engine of the options and close it at the end; a plan opens nothing.
 
-    Raises ``UserError`` for an engine that cannot run here, or whose cluster is not reached.
+    Raises ``UserError`` for an engine that cannot run here or cannot reach its cluster.
     """
     engine = make_engine(options.engine, options.address)
     if options.plan:

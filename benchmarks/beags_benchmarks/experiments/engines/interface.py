@@ -1,4 +1,4 @@
-"""What every engine does: it runs trials, each in a process of its own, and says how they ended."""
+"""The interface of engines, which run trials in processes of their own and return the outcomes."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from beags_benchmarks.experiments.trials import Trial
 
 @dataclass(frozen=True)
 class Needs:
-    """What a trial is expected to take. cores: that it keeps busy; None: not known. memory_mb: the largest."""
+    """Expected needs of a trial. cores: cores that it keeps busy; None if unknown. memory_mb: peak memory."""
 
     cores: int | None = None
-    memory_mb: float = 1000.0  # of the loaded program alone: 900
+    memory_mb: float = 1000.0  # the loaded program takes 900
 
 
 @dataclass(frozen=True)
 class Job:
     """A trial to run.
 
-    order: its place in the experiment. folder: of the trial, absolute. base: folder of the trial that it starts from,
-    which has ended.
+    order: its place in the experiment. folder: folder of the trial, absolute. base: folder of the finished trial that
+    it starts from.
     """
 
     order: int
@@ -34,7 +34,7 @@ class Job:
 
     @property
     def request(self) -> dict[str, Any]:
-        """Return what ``trial.json`` holds, for ``worker``: plain values, paths absolute."""
+        """Return the content of ``trial.json`` for ``worker``: plain values, paths absolute."""
         trial = self.trial
         return {
             "preset": trial.preset,
@@ -53,7 +53,7 @@ class Job:
 class Outcome:
     """The outcome of a trial: the content of result.json, or the reason of its failure in a sentence.
 
-    killed: it failed because a signal ended it, as when memory ran out; what it had saved is still there.
+    killed: whether a signal ended it, for example when memory ran out; its saved state is still there.
     """
 
     folder: Path
@@ -63,9 +63,9 @@ class Outcome:
 
 
 class Engine(ABC):
-    """Runs jobs in any order. A context: leaving it ends what still runs.
+    """Runs jobs in any order. It is a context; leaving it ends running jobs.
 
-    Raises ``UserError`` when it is made if it cannot run.
+    The constructor raises ``UserError`` if the engine cannot run.
     """
 
     @classmethod
@@ -75,7 +75,7 @@ class Engine(ABC):
 
     @abstractmethod
     def __init__(self, address: str | None) -> None:
-        """Find the cluster at ``address``, if the engine has one."""
+        """Set the address of the cluster, if the engine has one."""
 
     @abstractmethod
     def __enter__(self) -> Engine: ...
@@ -85,11 +85,11 @@ class Engine(ABC):
 
     @abstractmethod
     def start(self, job: Job) -> None:
-        """Begin a job now or later; its base has ended well, and it is not done yet."""
+        """Begin a job now or later; its base has finished well and the job is not done yet."""
 
     @abstractmethod
     def wait(self) -> tuple[Job, Outcome]:
-        """Wait until one of the jobs that were started ends; returns it, with a folder that holds all its files.
+        """Wait until a started job ends; returns it with its outcome, whose folder holds all its files.
 
-        A job that fails has a reason; nothing is raised.
+        The outcome of a failed job has the reason; nothing is raised.
         """

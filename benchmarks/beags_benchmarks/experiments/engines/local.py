@@ -14,7 +14,7 @@ class LocalEngine(Engine):
 
     def __init__(self, address: str | None) -> None:
         if address is not None:
-            raise UserError(f"--address {address} is of a cluster: add --engine ray, or leave it out.")
+            raise UserError(f"--address {address} names a cluster: add --engine ray, or leave it out.")
         self._jobs: list[Job] = []
         self._worker = Worker()
 
@@ -25,10 +25,10 @@ class LocalEngine(Engine):
         self._worker.end()
 
     def start(self, job: Job) -> None:
-        """Keep the job for its turn."""
+        """Queue the job."""
         insort(self._jobs, job, key=lambda each: each.order)
 
     def wait(self) -> tuple[Job, Outcome]:
-        """Run the first of the jobs that were kept."""
+        """Run the first job of the queue."""
         job = self._jobs.pop(0)
         return job, run_in_folder(job.folder, job.request, self._worker)

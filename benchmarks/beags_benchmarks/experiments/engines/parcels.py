@@ -1,4 +1,4 @@
-"""Folders that travel as bytes to and from nodes that do not share them, and the paths in them."""
+"""Folders as bytes, for nodes that do not share them, and the paths in their configs."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from beags_plugin.system.whole_files import write_text_atomically
 
 
 def pack(folder: Path, only: Collection[str] = ()) -> bytes:
-    """Return a folder as an uncompressed tar file (photos and checkpoints are no smaller), without locks.
+    """Return a folder as an uncompressed tar file without locks; photos and checkpoints hardly compress.
 
-    only: names of the files in it to take; all if empty.
+    only: names of the files to pack; all if empty.
     """
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w") as tar:
@@ -29,36 +29,38 @@ def pack(folder: Path, only: Collection[str] = ()) -> bytes:
 
 
 def unpack(parcel: bytes, folder: Path) -> None:
-    """Make ``folder`` hold what ``pack`` took, all at once; raises ``UserError`` where the disk does not let it."""
+    """Replace ``folder`` by the content of a parcel of ``pack``; raises ``UserError`` if it cannot be written."""
     part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     with writing(folder):
         shutil.rmtree(part, ignore_errors=True)
         try:
             part.mkdir(parents=True)
             with tarfile.open(fileobj=io.BytesIO(parcel)) as tar:
-                tar.extraction_filter = getattr(tarfile, "data_filter", None)  # not in the first Pythons 3.10
+                tar.extraction_filter = getattr(
+                    tarfile, "data_filter", None
+                )  # missing in early versions of Python 3.10
                 tar.extractall(part)
             if folder.exists():
                 shutil.rmtree(folder)
             part.rename(folder)
         finally:
-            shutil.rmtree(part, ignore_errors=True)  # of a full disk
+            shutil.rmtree(part, ignore_errors=True)  # the rest of a failed attempt
 
 
 def relocate(folder: Path, moved: Mapping[Path, Path]) -> None:
-    """Let the configs of the runs below ``folder`` name other places. moved: new places by old ones, both folders."""
+    """Change paths in the configs of the runs below ``folder``. moved: old folder to new folder."""
     from beags_plugin.plugin.options.config import CONFIG_FILE, config_text
     from beags_plugin.plugin.options.saved_config import load_run_config
 
     if not moved:
         return
-    moved = dict(sorted(moved.items(), key=lambda pair: -len(pair[0].parts)))  # a folder in another one goes first
+    moved = dict(sorted(moved.items(), key=lambda pair: -len(pair[0].parts)))  # inner folders come first
     for path in sorted(folder.rglob(CONFIG_FILE)):
         write_text_atomically(config_text(_relocated(load_run_config(path), moved)), path)
 
 
 def _relocated(value: Any, moved: Mapping[Path, Path]) -> Any:
-    """Return a config's value with its paths moved; a dataclass is changed itself."""
+    """Return a config's value with its paths moved; dataclasses are changed in place."""
     if isinstance(value, Path):
         for old, new in moved.items():
             if value.is_relative_to(old):

@@ -1,4 +1,4 @@
-"""The engine of many machines: every training and every scoring is a task of a Ray cluster."""
+"""The engine for many machines: every training and every scoring is a task of a Ray cluster."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
 from beags_plugin.system.whole_files import write_text_atomically
 
-MOST_ATTEMPTS = 4  # at a task whose worker or node is lost
-USUAL_CORES = 4  # of a trial of which nothing is known
-STORE_BYTES = 256 << 20  # of the object store of a cluster that this command starts: its one node shares the folder
-LOOK_SECONDS = 30.0  # between two looks at the cluster while nothing ends
-MARK = ".mark"  # file of the folder of all trials, whose content tells it from others
-_PASSED_ON = ("OMP_WAIT_POLICY",)  # and all that begin with BEAGS_
+MOST_ATTEMPTS = 4  # attempts at a task whose worker or node is lost
+USUAL_CORES = 4  # cores for a trial of an unknown kind
+STORE_BYTES = 256 << 20  # object store of a local cluster, whose one node shares the folder
+LOOK_SECONDS = 30.0  # seconds between two checks of the cluster while nothing ends
+MARK = ".mark"  # file in the folder of all trials whose content identifies the folder
+_PASSED_ON = ("OMP_WAIT_POLICY",)  # variables for tasks, besides those that begin with BEAGS_
 
 
 def share(needs: Needs, nodes: Sequence[Mapping[str, float]]) -> dict[str, float] | None:
-    """Return what a task asks of a node, as options of a Ray task; None if no node can run any.
+    """Return the resources that a task requests, as options of a Ray task; None if no node can run it.
 
-    nodes: the resources of each. Where one has a GPU, every task asks for one: figures of a CPU are others. A forecast
-    above the largest node asks for that node.
+    nodes: the resources of each. If any node has a GPU, every task requests one, since CPUs give other results. A
+    forecast above the largest node requests that node.
     """
     nodes = [node for node in nodes if node.get("CPU", 0) >= 1]
     gpus = [node for node in nodes if node.get("GPU", 0) >= 1]
@@ -50,7 +50,7 @@ def share(needs: Needs, nodes: Sequence[Mapping[str, float]]) -> dict[str, float
 
 @dataclass(frozen=True)
 class _Running:
-    """A task under way. parcel: reference to the bytes of its folder, which few tasks return."""
+    """A running task. parcel: reference to the bytes of its folder, which few tasks return."""
 
     job: Job
     until: str
@@ -72,8 +72,8 @@ class RayEngine(Engine):
     def __init__(self, address: str | None) -> None:
         self._address = address
         self._ray: Any = None
-        self._own = False  # whether leaving ends the connection
-        self._on_sigterm: Any = None  # what SIGTERM did before Ray set a handler of its own
+        self._own = False  # whether this object opened the connection
+        self._on_sigterm: Any = None  # handler of SIGTERM before Ray replaced it
         self._task: Any = None
         self._running: dict[Any, _Running] = {}
         self._parcels: dict[str, Any] = {}  # references by digest of the folder
@@ -85,7 +85,7 @@ class RayEngine(Engine):
         import ray  # pyright: ignore[reportMissingImports]  (an extra)
 
         self._ray = ray
-        os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")  # of parcels that nobody fetches
+        os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")  # parcels that are never fetched would be reported
         if not ray.is_initialized():
             self._on_sigterm = signal.getsignal(signal.SIGTERM)
             try:
@@ -103,7 +103,7 @@ class RayEngine(Engine):
         if self._address is None:
             try:
                 self._ray.init(address="local", include_dashboard=False, object_store_memory=STORE_BYTES, **quiet)
-            except Exception as error:  # its processes have 15 seconds to begin
+            except Exception as error:  # its processes must start within 15 seconds
                 raise UserError(
                     f"Ray cannot start on this machine ({_first_line(error)}): try again when it is less busy, or "
                     "leave --engine out."
@@ -112,9 +112,9 @@ class RayEngine(Engine):
         host, _, port = self._address.rpartition(":")
         try:
             if host and port.isdigit():
-                socket.create_connection((host, int(port)), timeout=10.0).close()  # Ray itself tries for minutes
+                socket.create_connection((host, int(port)), timeout=10.0).close()  # Ray itself would retry for minutes
             self._ray.init(address=self._address, **quiet)
-        except Exception as error:  # Ray has no common error for it
+        except Exception as error:  # Ray has no common class for these errors
             raise UserError(
                 f"there is no Ray cluster at {self._address} ({_first_line(error)}): start one with ray start --head "
                 "and run this on one of its nodes, or leave --address out to use this machine."
@@ -136,21 +136,21 @@ class RayEngine(Engine):
             signal.signal(signal.SIGTERM, self._on_sigterm or signal.SIG_DFL)
 
     def _forget(self) -> None:
-        """Let every node remove what it was sent."""
+        """Remove the inputs that nodes received."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy  # pyright: ignore[reportMissingImports]
 
         ray = self._ray
         task = ray.remote(num_cpus=0)(_forget)
-        left = [
+        removals = [
             task.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)).remote(
                 dict.fromkeys(self._parcels)
             )
             for node in self._nodes()
         ]
-        ray.wait(left, num_returns=len(left), timeout=LOOK_SECONDS)
+        ray.wait(removals, num_returns=len(removals), timeout=LOOK_SECONDS)
 
     def start(self, job: Job) -> None:
-        """Give the job to the cluster."""
+        """Submit the job to the cluster."""
         if self._mark is None:
             path = job.folder.parent / MARK
             if not path.exists():
@@ -164,7 +164,7 @@ class RayEngine(Engine):
         return _Running(job, SCORED if is_trained else TRAINED, attempt=attempt)
 
     def wait(self) -> tuple[Job, Outcome]:
-        """Wait for the cluster; a task that was lost, or whose node is unfit, is given to it again."""
+        """Wait for the cluster; a task that was lost or whose node is unfit is submitted again."""
         while True:
             ready, _ = self._ray.wait(list(self._running), num_returns=1, timeout=LOOK_SECONDS)
             if not ready:
@@ -180,9 +180,9 @@ class RayEngine(Engine):
         request = job.request
         inputs = {name: Path(request[name]) for name in FOLDERS if request[name] is not None}
         digests = {name: folder_digest(path) for name, path in inputs.items()}
-        asked = share(job.needs, [node["Resources"] for node in self._nodes(fit=True)])
-        asked = asked or share(job.needs, [{"CPU": 1, "memory": 0.0}])  # waits for a node
-        assert asked is not None
+        resources = share(job.needs, [node["Resources"] for node in self._nodes(fit=True)])
+        resources = resources or share(job.needs, [{"CPU": 1, "memory": 0.0}])  # waits for a node
+        assert resources is not None
         environment = {name: os.environ[name] for name in os.environ if name.startswith("BEAGS_") or name in _PASSED_ON}
         task = Task(
             str(job.folder),
@@ -190,23 +190,23 @@ class RayEngine(Engine):
             request,
             running.until,
             job.trial.code,
-            {**environment, "OMP_NUM_THREADS": str(int(asked["num_cpus"]))},
+            {**environment, "OMP_NUM_THREADS": str(int(resources["num_cpus"]))},
             {name: Input(str(path), digests[name], self._parcels.get(digests[name])) for name, path in inputs.items()},
             running.trained,
         )
-        options = {"name": f"{running.until} {job.folder.name}", **asked}
+        options = {"name": f"{running.until} {job.folder.name}", **resources}
         if self._unfit:
             options["label_selector"] = {"ray.io/node-id": f"!in({','.join(self._unfit)})"}
         report, parcel = self._task.options(**options).remote(task)
         self._running[report] = replace(running, parcel=parcel)
 
     def _ended(self, reference: Any, running: _Running) -> Outcome | None:
-        """Return the outcome of a job one of whose tasks ended; None if it goes on."""
+        """Return the outcome of a job after one of its tasks ended; None if the job continues."""
         ray, job = self._ray, running.job
         try:
             report: Report = ray.get(reference)
         except ray.exceptions.RayTaskError as error:
-            if isinstance(error.cause, ray.exceptions.RayError):  # the node that held what was sent
+            if isinstance(error.cause, ray.exceptions.RayError):  # the node with its inputs is gone
                 return self._again(self._from_the_start(job, running.attempt), "what it needs was lost")
             return Outcome(job.folder, None, f"its task failed: {_first_line(error.cause or error)}")
         except ray.exceptions.RayError as error:
@@ -228,11 +228,11 @@ class RayEngine(Engine):
             return replace(outcome, folder=job.folder)
         except ray.exceptions.RayError as error:
             return self._again(running, f"its result was lost ({type(error).__name__})")
-        except UserError as error:  # the disk of this machine, perhaps
+        except UserError as error:  # for example a full disk of this machine
             return Outcome(job.folder, None, str(error))
 
     def _sent(self, running: _Running, lacks: Sequence[str]) -> None:
-        """Pack what a node lacks, and give the task to the cluster again."""
+        """Pack the inputs that a node lacks and submit the task again."""
         for name in lacks:
             if name == TRAINED_FOLDER:
                 running = replace(running, trained=self._ray.put(pack(running.job.folder)))
@@ -250,7 +250,7 @@ class RayEngine(Engine):
         return None
 
     def _elsewhere(self, running: _Running, node: str, reason: str) -> Outcome | None:
-        """Give the task to another node; if all are unfit, the job fails."""
+        """Submit the task for another node; the job fails if all are unfit."""
         if node not in self._unfit:
             say(f"A node is left out: {reason}")
             self._unfit[node] = reason
@@ -260,12 +260,12 @@ class RayEngine(Engine):
         return None
 
     def _nodes(self, fit: bool = False) -> list[dict[str, Any]]:
-        """Return the nodes that live, without those that cannot run our tasks if ``fit``."""
+        """Return the live nodes; fit: only those that can run our tasks."""
         alive = [node for node in self._ray.nodes() if node["Alive"]]
         return [node for node in alive if node["NodeID"] not in self._unfit] if fit else alive
 
     def _look(self) -> None:
-        """Say once if no node can run what waits, e.g. since the last one with a GPU was lost."""
+        """Print once that no node can run the waiting tasks, for example after the last one with a GPU was lost."""
         stuck = share(Needs(), [node["Resources"] for node in self._nodes(fit=True)]) is None
         if stuck and not self._waits:
             say("The cluster has no node that can run a trial: waiting for one to join.")

@@ -1,8 +1,8 @@
-"""What a node of a Ray cluster does for a trial: it trains it, or scores what was trained.
+"""Tasks on a node of a Ray cluster: training a trial, or scoring a trained one.
 
-It works in the trial's folder where it sees that of the command (shared storage), else in a folder of its own, and
-then it returns what it made. Photos, masks and bases that it does not see are sent to it once. Configs of runs name the
-places of the command wherever they are not in use.
+A node works in the trial's folder if it shares that of the command, else in a folder of its own, whose content it
+returns. Photos, masks and bases that it does not see are sent to it once. Configs of runs hold the paths of the command
+while no task uses them.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from beags_plugin.system.digests import folder_digest
 from beags_plugin.system.errors import UserError, writing
 
 FOLDERS = ("data", "masks", "base")
-"""Entries of a trial's request that are folders which the trial reads."""
+"""Entries of a trial's request that name folders which the trial reads."""
 TRAINED_FOLDER = "trained folder"
-"""What a node lacks, besides inputs, that scores what another one trained."""
+"""Name, among missing inputs, of the folder that another node trained."""
 _OF_FAILURES = ("failed.json", "log.txt", "trial.json")
 
 
 @dataclass(frozen=True)
 class Input:
-    """A folder that a trial reads. path: where the command sees it. digest: ``folder_digest`` there.
+    """A folder that a trial reads. path: its path for the command. digest: its ``folder_digest``.
 
-    parcel: a reference to its bytes, or None as long as no node lacked it.
+    parcel: a reference to its bytes; None until a node lacks it.
     """
 
     path: str
@@ -50,10 +50,10 @@ class Input:
 class Task:
     """One step of a trial, for one node.
 
-    folder: of the trial, as the command sees it. mark: a file beside it, and what it holds: a node that reads the same
-    shares the folder. request: ``Job.request``. until: ``TRAINED`` or ``SCORED``. code: digest of the command's code.
-    environment: variables of the trial. inputs: by name in the request. trained: reference to the bytes of the folder
-    once it was trained, if another node did that on its own disk.
+    folder: path of the trial for the command. mark: a file beside it and its content: a node that reads the same
+    content shares the folder. request: ``Job.request``. until: ``TRAINED`` or ``SCORED``. code: digest of the command's
+    code. environment: variables of the trial. inputs: by name in the request. trained: reference to the bytes of the
+    trained folder, if another node trained it on its own disk.
     """
 
     folder: str
@@ -68,10 +68,10 @@ class Task:
 
 @dataclass(frozen=True)
 class Report:
-    """How a task ended.
+    """The end of a task.
 
-    node, host: who did it. outcome: None where it was not done: ``lacks`` names what to send, or ``unfit`` says in a
-    sentence why this node can do none. shared: whether the files are in the trial's folder.
+    node, host: where it ran. outcome: None if it was not done: ``lacks`` then names inputs to send, or ``unfit`` is a
+    sentence on why this node can run no task. shared: whether the files are in the trial's folder.
     """
 
     node: str
@@ -83,7 +83,7 @@ class Report:
 
 
 def perform(task: Task, node: str, fetch: Callable[[Any], bytes]) -> tuple[Report, bytes | None]:
-    """Do the task; returns how it ended and, where the trial's folder is not shared, its bytes.
+    """Run the task; returns its report and, if the trial's folder is not shared, the folder's bytes.
 
     node: id of the node in its cluster. fetch: returns the bytes of a reference.
     """
@@ -125,12 +125,12 @@ def perform(task: Task, node: str, fetch: Callable[[Any], bytes]) -> tuple[Repor
         return Report(node, host, unfit=f"{outcome.failed} (on {host})"), None
     parcel = pack(folder, _OF_FAILURES if outcome.failed and not (folder / "trained.json").exists() else ())
     shutil.rmtree(folder, ignore_errors=True)
-    failed = outcome.failed and outcome.failed.replace(str(folder), task.folder)  # where its log will lie
+    failed = outcome.failed and outcome.failed.replace(str(folder), task.folder)  # future path of its log
     return Report(node, host, replace(outcome, failed=failed), shared=False), parcel
 
 
 def forget(node: str, digests: Mapping[str, Any]) -> None:
-    """Remove the inputs of these digests that this node was sent."""
+    """Remove inputs with these digests that this node received."""
     for digest in digests:
         shutil.rmtree(_own_folder(node) / "inputs" / digest, ignore_errors=True)
 
@@ -153,15 +153,15 @@ def _reads(path: str, content: str) -> bool:
         return False
 
 
-def _place(wanted: Input, kept: Path, fetch: Callable[[Any], bytes]) -> Path | None:
-    """Return where this node has an input: the very folder, or what it was sent; None if it has to be sent."""
+def _place(wanted: Input, copies: Path, fetch: Callable[[Any], bytes]) -> Path | None:
+    """Return this node's path of an input, the folder itself or a received copy; None if it has to be sent."""
     path = Path(wanted.path)
     if path.is_dir() and folder_digest(path) == wanted.digest:
         return path
-    copy = kept / wanted.digest
+    copy = copies / wanted.digest
     with writing(copy):
-        kept.mkdir(exist_ok=True)
-    with FileLock(kept / f".{wanted.digest}.lock"):  # another task of this node may unpack it
+        copies.mkdir(exist_ok=True)
+    with FileLock(copies / f".{wanted.digest}.lock"):  # another task of this node may be unpacking it
         if not copy.exists():
             if wanted.parcel is None:
                 return None
@@ -178,11 +178,12 @@ _program: tuple[dict[str, str], Worker] | None = None
 
 
 def _worker(environment: Mapping[str, str]) -> Worker:
-    """Return the program that runs trials with these variables; it ends with this process, or for one with others."""
+    """Return the worker for these variables; it ends with this process, or when other variables need a new one."""
     global _program
-    wanted = {**environment, "CUDA_VISIBLE_DEVICES": os.environ.get("CUDA_VISIBLE_DEVICES", "")}  # by Ray, for the task
-    if _program is None or _program[0] != wanted:
+    # Ray sets the visible devices of each task.
+    variables = {**environment, "CUDA_VISIBLE_DEVICES": os.environ.get("CUDA_VISIBLE_DEVICES", "")}
+    if _program is None or _program[0] != variables:
         if _program is not None:
             _program[1].end()
-        _program = wanted, Worker(environment)
+        _program = variables, Worker(environment)
     return _program[1]

@@ -64,21 +64,21 @@ def run_in_folder(folder: Path, request: dict[str, Any], worker: Worker, until: 
 
 
 def _lock(path: Path) -> AbstractContextManager[object]:
-    """Wait for a lock and hold it; hold nothing where the disk has no locks, as some network disks."""
+    """Wait for a lock and hold it; lock nothing on disks without locks, such as some network disks."""
     try:
         return FileLock(path).acquire()
     except NotImplementedError:
         return nullcontext()
     except OSError as error:
-        if error.filename is not None:  # the file cannot be opened
+        if error.filename is not None:  # the named file cannot be opened
             raise
         return nullcontext()
 
 
 def _goes_on(folder: Path, request: dict[str, Any]) -> bool:
-    """Return whether the folder holds an attempt at this trial that was ended from outside, or was trained.
+    """Return whether the folder holds an interrupted or trained attempt at this trial.
 
-    A training goes on with the very same request. One that has ended is scored, wherever its folder has been moved.
+    An interrupted training continues only for the same request. A finished one is scored, even if its folder has moved.
     """
     former = read_json(folder / "trial.json") or {}
     if (folder / "trained.json").exists():
@@ -88,19 +88,19 @@ def _goes_on(folder: Path, request: dict[str, Any]) -> bool:
 
 
 def _wait_for_end(run: Path) -> None:
-    """Wait for a training that still saves: its own program, which waited for it, was killed."""
+    """Wait for a training that is still saving after its parent was killed."""
     if (run / LOCK).exists():
-        with suppress(OSError):  # of a lock (a Timeout is one too): the training says so itself
+        with suppress(OSError):  # a Timeout is an OSError too; the training itself reports the lock
             FileLock(run / LOCK).acquire(timeout=_PATIENCE).lock.release()
 
 
 def finished(folder: Path) -> dict[str, Any] | None:
-    """Return the result of the trial in ``folder``; None if it has not finished well."""
+    """Return the result of the trial in ``folder``; None if it has none."""
     return read_json(folder / "result.json")
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
-    """Return the content of a JSON file that was written whole; None if there is none."""
+    """Return the content of a JSON file ; None if there is no valid one."""
     try:
         return json.loads(path.read_text())
     except (OSError, ValueError):
@@ -108,15 +108,15 @@ def read_json(path: Path) -> dict[str, Any] | None:
 
 
 class Worker:
-    """The program that runs trials, ``worker.serve``; the first trial starts it, ``end`` ends it.
+    """The program that runs trials, ``worker.serve``: the first trial starts it, ``end`` ends it.
 
-    environment: variables of its own, besides those of this process.
+    environment: variables that are added to those of this process.
     """
 
     def __init__(self, environment: Mapping[str, str] = MappingProxyType({})) -> None:
         self._environment = environment
         self._process: subprocess.Popen[str] | None = None
-        self._errors: IO[bytes] | None = None  # of the program itself; trials have logs
+        self._errors: IO[bytes] | None = None  # errors of the program itself; trials have logs
 
     def run(self, folder: Path, until: str = SCORED) -> int:
         """Run the trial in ``folder`` (see ``run_in_folder``); returns its exit code, negative for a signal."""
@@ -135,7 +135,7 @@ class Worker:
         try:
             print(until, folder.absolute(), file=self._process.stdin, flush=True)
             return int(self._process.stdout.readline())
-        except (OSError, ValueError):  # the program itself is gone
+        except (OSError, ValueError):  # the program itself has ended
             process, self._process = self._process, None
             process.stdin = None
             code = process.wait()

@@ -1,4 +1,4 @@
-"""The paper's data sets as files/paper/ describes them: scenes, resolution, split, objects, truth, figures."""
+"""The paper's data sets from files/paper/: scenes, resolution, split, objects, truth, figures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from beags_plugin.system.errors import UserError, check_choice, meant
 from beags_plugin.system.shipped import read_toml
 
 NAMES = ("mip360", "llff", "lerf", "3dovs")
-METHODS = "methods"  # the file of the methods, an experiment
+METHODS = "methods"  # name of the experiment of the methods
 METRICS = ("extracted", "rendered", "psnr")
 _ENTRIES = {
     "title", "folders", "layout", "images", "width", "split", "eval_interval", "metrics", "masks", "truth", "scenes",
@@ -23,10 +23,10 @@ _ENTRIES = {
 
 @dataclass(frozen=True)
 class MaskSource:
-    """The masks to train on. source: where the paper had them from. folder: below the scene, of id images.
+    """The masks to train on. source: their source in the paper. folder: folder of id images below the scene.
 
-    instead: a folder of the download that serves where ``folder`` is missing, or "". instead_source: what these are.
-    prompts: what the paper prompted with. texts: whether the objects' names are the prompts.
+    instead: folder of the download that replaces a missing ``folder``, or "". instead_source: source of that. prompts:
+    the paper's prompts. texts: whether the objects' names are the prompts.
     """
 
     source: str
@@ -39,9 +39,9 @@ class MaskSource:
 
 @dataclass(frozen=True)
 class TruthSource:
-    """The masks to score with. source: where the paper had them from.
+    """The masks to score with. source: their source in the paper.
 
-    visible: where visible masks belong below the scene. get: a command that gets them, or "".
+    visible: path for visible masks below the scene. get: a command that downloads them, or "".
     """
 
     source: str
@@ -53,11 +53,11 @@ class TruthSource:
 class PaperDataSet:
     """The content of ``files/paper/<name>.toml``.
 
-    folders: names below the data root: ours, then those of downloads. layout, eval_interval: options of ``beags-data``.
-    images: folder of the photos. width: to which wider ones are scaled down, pixels; None keeps them. split: in words.
-    metrics: which of ``METRICS`` the paper has. scenes: scene to its objects; none where the scene's own class names
-    say. open: what the paper leaves open, and our choice. figures: by "extracted" and "rendered", method to (IoU, BIoU)
-    in percent. psnr: dB before and after refinement, or None.
+    folders: names below the data root: our name, then those of downloads. layout, eval_interval: options of
+    ``beags-data``. images: folder of the photos. width: pixels to which wider photos are scaled down; None keeps all.
+    split: a description. metrics: those of ``METRICS`` that the paper has. scenes: scene to its objects; empty if the
+    scene's own class names apply. open: choices that the paper does not state, and ours. figures: "extracted" and
+    "rendered" to method to (IoU, BIoU) in percent. psnr: dB before and after refinement, or None.
     """
 
     name: str
@@ -77,24 +77,24 @@ class PaperDataSet:
     psnr: tuple[float, float] | None = None
 
     def folder(self, root: Path) -> Path:
-        """Return the folder of the data set below the data root: the first that is there, else the one of our name."""
+        """Return the folder of the data set below the data root: the first that exists, else the one with our name."""
         return next((root / name for name in self.folders if (root / name).is_dir()), root / self.folders[0])
 
 
 def paper_folder() -> Path:
-    """Return the folder of the files."""
+    """Return the folder of the data sets' files."""
     return FILES / "paper"
 
 
 def read_data_sets(names: Sequence[str] = ()) -> list[PaperDataSet]:
-    """Read the data sets of these names, all if empty; raises ``UserError`` for another name or a wrong file."""
+    """Read the data sets of these names, all if empty; raises ``UserError`` for an unknown name or a wrong file."""
     for name in names:
         check_choice(name, NAMES, "data set", " of the paper")
     return [read_data_set(paper_folder() / f"{name}.toml") for name in NAMES if name in (names or NAMES)]
 
 
 def read_data_set(path: Path) -> PaperDataSet:
-    """Read one file; raises ``UserError`` that names the file and the entry that is wrong."""
+    """Read one file; raises a ``UserError`` that names the file and the wrong entry."""
     content = read_toml(path, "data set")
     try:
         return _data_set(path.stem, content)

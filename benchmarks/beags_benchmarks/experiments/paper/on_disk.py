@@ -1,9 +1,8 @@
-"""What of the paper's data sets is on disk, and where the rest belongs."""
+"""The parts of the paper's data sets that are on disk, and where missing parts belong."""
 
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import math
 import shlex
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from beags_benchmarks.experiments.paper.data_sets import PaperDataSet
-from beags_benchmarks.experiments.scenes import TrialScene
+from beags_benchmarks.experiments.scenes import SceneSize, TrialScene, quiet
 from beags_plugin.data import LAYOUTS
 from beags_plugin.data.files import image_size, list_images
 from beags_plugin.data.quick import QUICK_PIXELS
@@ -26,13 +25,13 @@ TRUTH = "ground_truth"
 
 @dataclass(frozen=True)
 class Sizes:
-    """How small the photos are made. downscale: divides the paper's sizes. quick: to some 50,000 pixels."""
+    """Sizes of photos. downscale: divisor of the paper's sizes. quick: some 50,000 pixels instead."""
 
     downscale: float = 1.0
     quick: bool = False
 
     def factor(self, data_set: PaperDataSet, photo: Path) -> float:
-        """Return what the sides of a photo's file are divided by."""
+        """Return the divisor of the sides of a photo's file."""
         width, height = image_size(photo)
         if self.quick:
             return max(1.0, float(math.ceil(math.sqrt(width * height / QUICK_PIXELS))))
@@ -43,9 +42,9 @@ class Sizes:
 class SceneOnDisk:
     """One scene of a data set.
 
-    scene: to train on, or None where the folder or a part is missing that training needs. missing: sentences, what is
-    missing and where it belongs, of these parts. notes: likewise, of what only the figures lack. views: number of
-    training views. pixels: of all of them, as they are trained on.
+    scene: the scene to train on, or None if the folder or a part that training needs is missing. missing: sentences on
+    these parts and where they belong. notes: sentences on parts that only the scores lack. size: of the
+    training views.
     """
 
     data_set: PaperDataSet
@@ -54,8 +53,7 @@ class SceneOnDisk:
     scene: TrialScene | None = None
     missing: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    views: int = 0
-    pixels: int = 0
+    size: SceneSize = SceneSize(0, 0)
 
 
 def find_scenes(
@@ -79,7 +77,7 @@ def find_scenes(
 
 
 def find_scene(data_set: PaperDataSet, name: str, folder: Path, output: Path, sizes: Sizes) -> SceneOnDisk:
-    """Look for a scene's parts: photos, poses, masks, names, truth."""
+    """Return a scene with its parts on disk: photos, poses, masks, names, truth."""
     absent = SceneOnDisk(data_set, name, folder)
     if not folder.is_dir():
         return absent
@@ -108,13 +106,13 @@ def find_scene(data_set: PaperDataSet, name: str, folder: Path, output: Path, si
         factor = sizes.factor(data_set, photos[0])
         digest = folder_digest(folder, without=folder / TRUTH)
         scene = TrialScene(f"{data_set.name}/{name}", folder.resolve(), factor, digest, options=options)
-        held_out, pixels, views = _read(scene)
+        held_out, size = _read(scene)
     except UserError as error:
         return _without(absent, [str(error)])
     if data_set.width is not None and not sizes.quick and (width := image_size(photos[0])[0]) < data_set.width:
         notes.append(f"the photos in {folder / data_set.images} are {width} pixels wide, not {data_set.width}")
     notes += _truth_notes(data_set, name, folder, held_out)
-    return SceneOnDisk(data_set, name, folder, scene, (), tuple(notes), views, pixels)
+    return SceneOnDisk(data_set, name, folder, scene, (), tuple(notes), size)
 
 
 def _without(scene: SceneOnDisk, missing: Sequence[str]) -> SceneOnDisk:
@@ -126,7 +124,7 @@ def _has_masks(folder: Path) -> bool:
 
 
 def _make_masks(scene: SceneOnDisk, output: Path) -> str:
-    """Return the command that makes a scene's masks; where its objects are known by text, their prompts are written."""
+    """Return the command that makes a scene's masks; writes the prompts of objects that are known by text."""
     masks, folder = scene.data_set.masks, scene.folder
     prompts = folder / "prompts.json"
     if masks.texts and (names := _texts(scene)):
@@ -147,20 +145,18 @@ def _texts(scene: SceneOnDisk) -> tuple[str, ...]:
     return ()
 
 
-def _read(scene: TrialScene) -> tuple[Mapping[str, Any], int, int]:
-    """Return the metadata of the held-out views, and number of pixels and of views to train on."""
+def _read(scene: TrialScene) -> tuple[Mapping[str, Any], SceneSize]:
+    """Return the metadata of the held-out views and the size of the training views."""
     parser = scene.parser()
     parser.downscale_factor = scene.downscale
-    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
+    with quiet():
         made = parser.setup()
         held_out, training = (made.get_dataparser_outputs(split) for split in ("test", "train"))
-    cameras = training.cameras
-    pixels = int((cameras.width.long() * cameras.height.long()).sum())
-    return held_out.metadata, pixels, len(training.image_filenames)
+    return held_out.metadata, SceneSize.of(training)
 
 
 def _truth_notes(data_set: PaperDataSet, name: str, folder: Path, held_out: Mapping[str, Any]) -> list[str]:
-    """Return what the figures of a scene lack: names, visible masks, silhouettes."""
+    """Return sentences on what the scores of a scene lack: names, visible masks, silhouettes."""
     notes = []
     classes = [each for class_id, each in held_out["classes"].items() if class_id != 0]
     wanted = list(data_set.scenes[name]) or classes
@@ -169,7 +165,7 @@ def _truth_notes(data_set: PaperDataSet, name: str, folder: Path, held_out: Mapp
         notes.append(f"no class is called {names}: name the ids of the masks in {folder / 'classes.json'}")
     elif any(each == f"class_{class_id}" for class_id, each in held_out["classes"].items()):
         notes.append(f"the names of the ids of the masks belong in {folder / 'classes.json'}")
-    wanted = [each for each in wanted if each in classes]  # no other can be scored
+    wanted = [each for each in wanted if each in classes]  # others cannot be scored
     truth = held_out["ground_truth"] or {"masks": [], "visible": {}, "silhouettes": {}}
     own = held_out["no_truth"] is None and not truth["visible"] and any(held_out["mask_filenames"])
     visible = {each for each, files in truth["visible"].items() if any(files)}

@@ -23,7 +23,7 @@ class PaperOptions(EngineOptions):
     scenes: tuple[str, ...] = ()
     """Which scenes, by name; all if left out."""
     preset: str | None = None
-    """What to train with instead of beags-paper: a preset of method_configs/; figures are then not the paper's."""
+    """Preset of method_configs/ instead of beags-paper; figures are then not the paper's."""
     downscale: float = 1.0
     """Divide the paper's image sizes by this; figures are then not the paper's."""
     quick: bool = False

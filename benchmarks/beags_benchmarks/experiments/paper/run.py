@@ -9,11 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from beags_benchmarks.experiments.engines import open_engine
 from beags_benchmarks.experiments.engines.interface import Engine, Outcome
-from beags_benchmarks.experiments.engines.trial_folder import finished
+from beags_benchmarks.experiments.engines.trial_folder import finished, read_json
 from beags_benchmarks.experiments.experiment import Experiment, load_experiment
 from beags_benchmarks.experiments.forecast import Forecast
 from beags_benchmarks.experiments.options import ExperimentOptions
@@ -29,16 +27,14 @@ from beags_benchmarks.experiments.paper.tables import (
 )
 from beags_benchmarks.experiments.report import provenance, write_csv, write_json
 from beags_benchmarks.experiments.results import protocol_of, report_json, table_rows
-from beags_benchmarks.experiments.run import TABLE_WIDTH, adapted, print_plan, processors, rows_of, trained
-from beags_benchmarks.experiments.scenes import SceneSize
+from beags_benchmarks.experiments.run import CONSOLE, adapted, print_plan, print_tables, processors, rows_of, trained
 from beags_benchmarks.experiments.trials import VariantTrial, code_of_trials, plan
 from beags_benchmarks.provenance import busy_note
 from beags_plugin.system.digests import folder_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.whole_files import write_text_atomically
 
-CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-SCORED_BY = "measured.json"  # in a trial's folder: which truth its figures are of
+SCORED_BY = "measured.json"  # file in a trial's folder with the digest of the truth of its scores
 
 
 def run_paper(options: PaperOptions) -> Outcomes | None:
@@ -57,7 +53,7 @@ def run_paper(options: PaperOptions) -> Outcomes | None:
 def _run(
     options: PaperOptions, data_sets: Sequence[PaperDataSet], experiment: Experiment, engine: Engine
 ) -> Outcomes | None:
-    """Do what ``run_paper`` does, with the engine."""
+    """Run the experiment on an open engine; see ``run_paper``."""
     scenes = find_scenes(
         data_sets, options.data_root, options.output, Sizes(options.downscale, options.quick), options.scenes
     )
@@ -73,7 +69,7 @@ def _run(
     if options.plan:
         return None
     source = provenance()
-    busy = busy_note(int(source["machine"]["cores"]))  # before the trials: they keep the machine busy
+    busy = busy_note(int(source["machine"]["cores"]))  # read before the trials, which keep the machine busy
     truths = _truths(runs)
     _score_again(runs, truths, trials_folder)
     found = trained(runs, trials_folder, engine, forecast)
@@ -83,9 +79,7 @@ def _run(
     rows = rows_of(runs, found)
     outcomes = Outcomes(rows, {(run.scene.name, run.variant.name): _truth(run, found) for run in runs})
     methods = [variant.name for variant in experiment.variants]
-    wide = Console(width=max(CONSOLE.width, TABLE_WIDTH), highlight=False, markup=False)
-    for table in paper_tables(data_sets, methods, outcomes):
-        (CONSOLE if isinstance(table, str) else wide).print(table)
+    print_tables(paper_tables(data_sets, methods, outcomes))
     for line in _lines(experiment, options, outcomes):
         CONSOLE.print(line)
     files = {kind: getattr(options, kind) or options.output / f"paper.{kind}" for kind in ("json", "csv")}
@@ -104,7 +98,7 @@ def forecast_of(
 ) -> tuple[Forecast, dict[str, str]]:
     """Return the forecast of the trials in ``folder``, and titles of the scenes by name."""
     found = {scene.scene.name: scene for scene in scenes if scene.scene is not None}
-    sizes = {name: SceneSize(scene.views, scene.pixels) for name, scene in found.items()}
+    sizes = {name: scene.size for name, scene in found.items()}
     return Forecast(runs, sizes, folder), {n: f"{scene.data_set.title}, {scene.name}" for n, scene in found.items()}
 
 
@@ -116,20 +110,22 @@ def _methods(options: PaperOptions) -> Experiment:
 
 
 def _truths(runs: Sequence[VariantTrial]) -> dict[str, str]:
-    """Return a digest of the truth that is on disk now, for each trial; masks may be drawn after the training."""
-    found = {run.scene.name: run.scene.data / TRUTH for run in runs}
-    digests = {name: folder_digest(folder) if folder.is_dir() else "" for name, folder in found.items()}
+    """Return a digest of the truth on disk for each trial; its masks may be newer than the training."""
+    folders = {run.scene.name: run.scene.data / TRUTH for run in runs}
+    digests = {name: folder_digest(folder) if folder.is_dir() else "" for name, folder in folders.items()}
     return {trial.digest: digests[run.scene.name] for run in runs for trial in run.trials}
 
 
 def _score_again(runs: Sequence[VariantTrial], truths: Mapping[str, str], folder: Path) -> None:
-    """Let trials be scored again whose truth has changed since: they keep their training, but not the result."""
+    """Mark trials whose truth has changed to be scored again: they keep their training but lose their result."""
     changed = 0
     for trial in (trial for run in runs for trial in run.trials):
         place = folder / trial.folder_name
-        if (result := finished(place)) is None or _read(place / SCORED_BY).get("truth") == truths[trial.digest]:
+        if (result := finished(place)) is None or (read_json(place / SCORED_BY) or {}).get("truth") == truths[
+            trial.digest
+        ]:
             continue
-        if not (place / "trained.json").exists():  # of an older version
+        if not (place / "trained.json").exists():  # an older version wrote no such file
             write_text_atomically(json.dumps(result), place / "trained.json")
         (place / "result.json").unlink()
         changed += 1
@@ -137,22 +133,15 @@ def _score_again(runs: Sequence[VariantTrial], truths: Mapping[str, str], folder
         CONSOLE.print(f"{changed} trials are scored again, without training: their truth has changed.")
 
 
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError):
-        return {}
-
-
 def _truth(run: VariantTrial, outcomes: Mapping[str, Outcome]) -> str | None:
-    """Return what the extracted masks of a run were compared with; None where nothing was."""
+    """Return the kind of truth of a run's extracted masks; None if nothing was compared."""
     results = (outcomes[trial.digest].result for trial in run.trials)
     truths = {result["evaluation"]["extracted_truth"] for result in results if result is not None} - {None}
     return "both" if len(truths) > 1 else next(iter(truths), None)
 
 
 def _lines(experiment: Experiment, options: PaperOptions, outcomes: Outcomes) -> list[str]:
-    """Return what readers of the tables must know, the protocol too, and the failures."""
+    """Return the notes below the tables: the protocol, deviations from the paper, and failures."""
     protocol = protocol_of(outcomes.rows)
     lines = [] if protocol is None else [protocol]
     if options.quick or options.downscale != 1.0 or experiment.preset != "beags-paper":

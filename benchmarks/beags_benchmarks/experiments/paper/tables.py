@@ -1,4 +1,4 @@
-"""The paper's tables with ours beside them, and what is missing, for a terminal."""
+"""The paper's tables with our results beside them, and lists of missing parts, for a terminal."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MISSING = "–"
 
 @dataclass(frozen=True)
 class Outcomes:
-    """What was measured: rows, and by row the truth of its extracted masks ("silhouette", "visible", "both", None)."""
+    """Results: rows, and for each row the truth of its extracted masks ("silhouette", "visible", "both", None)."""
 
     rows: Sequence[ResultRow]
     truths: Mapping[tuple[str, str], str | None]  # (scene, variant)
@@ -31,7 +31,7 @@ class Outcomes:
 
 
 def missing_lines(scenes: Sequence[SceneOnDisk]) -> list[str]:
-    """Return a line for each part that is not on disk; the absent scenes of a data set share one."""
+    """Return a line for each part that is not on disk; the absent scenes of a data set share a line."""
     lines = []
     for data_set in dict.fromkeys(scene.data_set.name for scene in scenes):
         own = [scene for scene in scenes if scene.data_set.name == data_set]
@@ -47,18 +47,18 @@ def missing_lines(scenes: Sequence[SceneOnDisk]) -> list[str]:
 
 
 def paper_tables(data_sets: Sequence[PaperDataSet], methods: Sequence[str], outcomes: Outcomes) -> list[Table | str]:
-    """Return the table of extracted and that of rendered masks, each method's figures beside the paper's, and PSNR.
+    """Return tables of extracted masks, rendered masks and PSNR, with the paper's figures beside ours.
 
-    methods: ours, in order; those that only the paper has come after them.
+    methods: our methods, in order; methods that only the paper has come after them.
     """
     printed: list[Table | str] = []
     for kind, what in KINDS.items():
-        shown = [each for each in data_sets if kind in each.metrics]
-        others = (name for each in shown for name in each.figures.get(kind, {}))
+        scored = [each for each in data_sets if kind in each.metrics]
+        others = (name for each in scored for name in each.figures.get(kind, {}))
         names = [*methods, *dict.fromkeys(name for name in others if name not in methods)]
-        heads = [head for each in shown for head in (f"{each.title}\nours", "\nthe paper's")]
-        rows = [[name, *(cell for each in shown for cell in _cells(each, kind, name, outcomes))] for name in names]
-        if shown:
+        heads = [head for each in scored for head in (f"{each.title}\nours", "\nthe paper's")]
+        rows = [[name, *(cell for each in scored for cell in _cells(each, kind, name, outcomes))] for name in names]
+        if scored:
             printed.append(plain_table(f"{kind.capitalize()}: {what}; IoU / BIoU, %", ["method", *heads], rows))
     printed.append(_psnr_table([each for each in data_sets if "psnr" in each.metrics], methods, outcomes))
     legends = {
@@ -71,13 +71,13 @@ def paper_tables(data_sets: Sequence[PaperDataSet], methods: Sequence[str], outc
 
 
 def mean_row(data_set: PaperDataSet, method: str, outcomes: Outcomes) -> ResultRow | None:
-    """Return a method's mean over the scenes of a data set that were run; None without any."""
+    """Return a method's mean over the scenes of a data set that were run; None without scenes."""
     rows = [row for row in outcomes.of(data_set) if row.variant.name == method]
     return means(rows)[0] if rows else None
 
 
 def _cells(data_set: PaperDataSet, kind: str, method: str, outcomes: Outcomes) -> tuple[str, str]:
-    """Return ours, with its marks, and the paper's."""
+    """Return our cell with its marks, and the paper's."""
     paper = data_set.figures.get(kind, {}).get(method)
     theirs = _MISSING if paper is None else f"{paper[0]:.1f} / {paper[1]:.1f}"
     row = mean_row(data_set, method, outcomes)
