@@ -169,7 +169,7 @@ def test_sizes_shrink_in_half_of_the_steps():
 
 def test_views_come_in_rounds_without_those_that_have_no_mask():
     training = CodebookTraining(dots(8), OpenGaussianRefiner())
-    rounds = [[training._view(3 * number + place) for place in range(3)] for number in range(9)]
+    rounds = [[training.view_of(3 * number + place) for place in range(3)] for number in range(9)]
     assert all(sorted(each) == [0, 1, 2] for each in rounds) and len({tuple(each) for each in rounds}) > 2
     nothing = CodebookTraining(dots(8, unlabelled=True), OpenGaussianRefiner())
     stepped(nothing, range(8))

@@ -93,7 +93,7 @@ def evaluate_scene(
                 color, photo = renderer.image(surfels, background), view.image.to(surfels.means)
                 if (of_objects := object_pixels(view)) is not None:
                     of_objects = of_objects.to(color.device)
-                # Outside of objects that were trained alone, the rendering does not have the colours of the photo.
+                # The rendering does not have the colours of the photo outside of objects that were trained alone.
                 affine = affine_color_fit(color, photo, of_objects if objects_alone else None)
                 if not objects_alone:
                     fitted = psnr(fitted_colors(color, affine), photo)

@@ -19,7 +19,7 @@ def open3d_kernels() -> Any:
         return known
     spec = None if "open3d" in sys.modules else find_spec("open3d")
     if spec is None or spec.submodule_search_locations is None or sys.platform != "linux":
-        import open3d  # on other systems the package prepares what its libraries need
+        import open3d  # the package prepares what its libraries need on other systems
 
         return open3d
     package = ModuleType("open3d")  # takes the place of the package while the kernels are loaded

@@ -96,7 +96,7 @@ def make_scene(size: Size, seed: int = 0) -> Scene:
     depth = uniform(n, low=NEAREST, high=FARTHEST)
     means = torch.stack([(across - width / 2) * depth / focal, (down - height / 2) * depth / focal, depth], dim=-1)
     sigma = size.diameter / 2 * SIGMA_PER_RADIUS * depth / focal
-    sizes = 0.45 * torch.randn(n, 1, generator=g)  # as in trained scenes, a few surfels are large
+    sizes = 0.45 * torch.randn(n, 1, generator=g)  # a few surfels are large, as in trained scenes
     log_scales = sigma.log()[:, None] + sizes + 0.25 * torch.randn(n, 2, generator=g)
     camera = Camera(
         torch.eye(4), torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]), width, height

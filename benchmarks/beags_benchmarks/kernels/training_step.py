@@ -37,7 +37,7 @@ class TrainingStep:
         groups = [{"params": [value]} for value in self.parameters.values()]
         self.adam = torch.optim.Adam(
             groups, lr=0.0, eps=1e-15, fused=True
-        )  # with a rate of 0 all steps do the same work
+        )  # all steps do the same work at a rate of 0
         self.step = 0
         self.scene = scene
         self.rasterizer = rasterizer or make_rasterizer("auto")

@@ -228,7 +228,7 @@ class RayEngine(Engine):
             return replace(outcome, folder=job.folder)
         except ray.exceptions.RayError as error:
             return self._again(running, f"its result was lost ({type(error).__name__})")
-        except UserError as error:  # for example a full disk of this machine
+        except UserError as error:  # this machine's disk may be full
             return Outcome(job.folder, None, str(error))
 
     def _sent(self, running: _Running, lacks: Sequence[str]) -> None:
