@@ -35,9 +35,7 @@ class TrainingStep:
         surfels = {field.name: getattr(scene.surfels, field.name) for field in fields(Surfels)}
         self.parameters = {name: torch.nn.Parameter(value.clone().contiguous()) for name, value in surfels.items()}
         groups = [{"params": [value]} for value in self.parameters.values()]
-        self.adam = torch.optim.Adam(
-            groups, lr=0.0, eps=1e-15, fused=True
-        )  # all steps do the same work at a rate of 0
+        self.adam = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)  # all steps do the same work at a rate of 0
         self.step = 0
         self.scene = scene
         self.rasterizer = rasterizer or make_rasterizer("auto")

@@ -23,6 +23,7 @@ from beags_benchmarks.experiments.paper.run import forecast_of, run_paper
 from beags_benchmarks.experiments.paper.tables import Outcomes, paper_tables
 from beags_benchmarks.experiments.plan_table import plan_lines
 from beags_benchmarks.experiments.results import FIGURES, ResultRow
+from beags_benchmarks.experiments.scenes import SceneSize
 from beags_benchmarks.experiments.trials import Trial, VariantTrial
 from beags_plugin.commands import cli
 from beags_plugin.system.errors import UserError
@@ -142,7 +143,7 @@ def test_the_plan_scales_what_finished_trials_took(tmp_path):
     scenes, runs = [], []
     for name, pixels in (("room", 1_000_000), ("garden", 3_000_000)):
         scene = trial_scene(f"mip360/{name}", name)
-        scenes.append(SceneOnDisk(data_set, name, tmp_path / name, scene, views=10, pixels=pixels))
+        scenes.append(SceneOnDisk(data_set, name, tmp_path / name, scene, size=SceneSize(10, pixels)))
         base = Trial(scene, "beags-paper", {}, 1, "code")
         for each in (variant, other):
             trial = Trial(scene, "beags-paper", {"method": each.name}, 1, "code", base=base)

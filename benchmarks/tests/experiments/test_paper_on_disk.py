@@ -16,6 +16,7 @@ from paper_trees import OBJECTS, SCENES, write_tree
 from beags_benchmarks.experiments.paper.data_sets import read_data_sets
 from beags_benchmarks.experiments.paper.on_disk import SceneOnDisk, Sizes, find_scene, find_scenes
 from beags_benchmarks.experiments.paper.tables import missing_lines
+from beags_benchmarks.experiments.scenes import SceneSize
 from beags_plugin.masks.sources.prompts import read_prompts
 from beags_plugin.system.errors import UserError
 
@@ -49,7 +50,7 @@ def test_a_complete_scene_is_ready(trees, name):
         "3dovs": ["images are 80 pixels wide, not 1600"],
     }[name]
     assert len(found.notes) == len(noted) and all(map(str.__contains__, found.notes, noted))
-    assert found.views == TRAINING[name] and found.pixels == TRAINING[name] * 80 * 48
+    assert found.size == SceneSize(TRAINING[name], TRAINING[name] * 80 * 48)
     assert found.scene.name == f"{name}/{SCENES[name]}" and found.scene.downscale == 1.0
     outputs = found.scene.parser().setup().get_dataparser_outputs("test")
     assert len(outputs.image_filenames) == HELD_OUT[name]
