@@ -133,7 +133,7 @@ def test_the_major_axis_is_the_longer_scale_wherever_it_points():
 def test_it_moves_along_its_own_axis_in_space():
     """Turned out of the picture's plane, the disc moves in its own plane, and the picture of its centre inwards."""
     before = disc(20, 20, 8, 1)
-    tilt = torch.tensor([[math.cos(0.5), 0.0, math.sin(0.5), 0.0]]).double()  # about y
+    tilt = torch.tensor([[math.cos(0.5), 0.0, math.sin(0.5), 0.0]]).double()  # axis y
     before = replace(before, quats=quat_product(tilt, before.quats))
     after, changed = decomposed(before, range(22))
     assert changed == [0]
@@ -153,7 +153,7 @@ def test_both_ends_on_one_side_leave_every_bit(columns):
 
 def test_who_is_left_alone():
     whole = [disc(20, 20, 4, 1, depth=-1.0), disc(-3, 20, 4, 1), disc(20, 20, 0.2, 0.1), disc(20, 20, math.inf, 1)]
-    for before in whole:  # behind the camera; its centre out of the picture; ends in one pixel; broken
+    for before in whole:  # disc behind the camera; centre outside of the picture; both ends in one pixel; broken
         after, changed = decomposed(before, range(20))
         assert changed == [] and all(torch.equal(getattr(after, n), v) for n, v in vars(before).items())
     assert decomposed(disc(20, 20, 4, 1), range(23), ids=0)[1] == [], "of no object"

@@ -146,7 +146,7 @@ def test_options_that_cannot_work(options, sentence):
 
 def test_an_object_is_a_class_but_the_background():
     names = {0: "background", 1: "cup", 7: "7"}
-    make_refiner("cob-gs", {"object": 7}).check(names)  # as a command line reads it
+    make_refiner("cob-gs", {"object": 7}).check(names)  # a command line reads this number
     for name in ("cap", "background"):
         with pytest.raises(UserError, match=f"no object '{name}'.*choose one of cup, 7"):
             make_refiner("cob-gs", {"object": name}).check(names)

@@ -130,7 +130,7 @@ def test_gradients_of_pixels_reach_the_geometry():
     scene = make_scene(count=12, size=-1.0)
     names = ("means", "quats", "log_scales", "opacity_logits", "colors")
     leaves = {name: getattr(scene.inputs, name).clone().requires_grad_() for name in names}
-    classifier = nn.Linear(3, 4, dtype=torch.float64)  # of three channels, which are drawn as colours
+    classifier = nn.Linear(3, 4, dtype=torch.float64)  # takes three channels, which are rendered as colours
     scene = replace(scene, background=torch.zeros(3, dtype=torch.float64))
     pixel_loss(classifier, scene.draw(TorchRasterizer(), **leaves).color, scene.target).backward()
     assert all(leaf.grad.abs().max() > 1e-6 for leaf in leaves.values())

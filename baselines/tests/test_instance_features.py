@@ -51,7 +51,7 @@ def test_cohesion_takes_all_labelled_pixels_and_solid_means():
     assert loss.item() == pytest.approx((0.5 + 0.5 + 3.5) / 3 / 2)
     loss.backward()
     assert drawn.grad is not None and torch.isfinite(drawn.grad).all() and not drawn.grad[3].any()
-    assert drawn.grad[:3, 0].tolist() == pytest.approx([-1 / 4, 1 / 12, 1 / 6])  # through the mean too
+    assert drawn.grad[:3, 0].tolist() == pytest.approx([-1 / 4, 1 / 12, 1 / 6])  # gradients pass through the mean too
 
 
 def test_centres_are_drawn_and_features_get_the_gradient_as_it_is():

@@ -18,7 +18,7 @@ from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.filed_tensors import filed
 
-SIDE = 64  # inside of the mask are the columns from 32
+SIDE = 64  # columns from 32 on are inside the mask
 CENTERS = [32, 36, 38, 46]
 COUNTS = torch.tensor([[270, 374, 422, 540, 0], [270, 166, 118, 0, 0]])  # (n_in, n_out); the last is behind the camera
 
@@ -61,7 +61,13 @@ def test_who_is_split_and_who_is_removed():
     assert not to_split(agreement, large, 4.1).any()  # they are too small for it
     one_axis = torch.stack([large[:, 0], large[:, 0] - 9], dim=1)  # the larger scale decides
     assert to_split(agreement, one_axis, extent).tolist() == [True, True, True, False, False]
-    assert mask_logits.mixed(agreement, 0.5).tolist() == [True, True, False, False, False]  # of any size: 3 of 5 stay
+    assert mask_logits.mixed(agreement, 0.5).tolist() == [
+        True,
+        True,
+        False,
+        False,
+        False,
+    ]  # 3 of 5 stay, whatever their size
 
 
 def test_a_view_that_does_not_show_a_gaussian_counts_as_agreeing():

@@ -39,9 +39,9 @@ def suspect(*others: dict[int, int], least: int = 80) -> bool:
     [
         ([], False),  # contained in itself
         ([CONTAINED], False),  # 60 : 10 is 0.857
-        ([SPLIT], True),  # 50 : 20 is 0.714; in one of two
-        ([SPLIT, CONTAINED], True),  # in one of three
-        ([SPLIT, CONTAINED, CONTAINED], False),  # in one of four
+        ([SPLIT], True),  # 50 : 20 is 0.714; split in one of two
+        ([SPLIT, CONTAINED], True),  # split in one of three
+        ([SPLIT, CONTAINED, CONTAINED], False),  # split in one of four
         ([SPLIT, ZEROS, ZEROS], True),  # three quarters have no class: not shown there
         ([SPLIT, CONTAINED, spread((69, 0), (31, 1))], False),  # shown in one of four, in one split
         ([spread((80, 0), (20, 4)), SPLIT, CONTAINED], True),
@@ -70,7 +70,7 @@ def ground_and_object() -> tuple[torch.Tensor, torch.Tensor]:
 
 def test_seeds_are_traced_to_the_class_in_more_than_half_of_its_views():
     traced = [WHOLE] * 5
-    # in 3 of 5 views; in 2 of 4, being hidden in the fifth; in all
+    # Gaussian 200 is traced in 3 of 5 views; in 2 of 4, hidden in the fifth; in all.
     views = [{**each, 200: 1 if place < 3 else 2} for place, each in enumerate(traced)]
     views = [{**each, 201: 1 if place < 2 else 2} if place < 4 else each for place, each in enumerate(views)]
     found = tracked_masks([view_of(each) for each in views], 2_000, 10)

@@ -30,7 +30,7 @@ def test_contrast_is_a_sum_over_the_pixels_of_an_id():
     ids = torch.tensor([7] * 30 + [40_000] * 30)
     value = codebook.contrast(rows((30, X), (30, Y)), ids)
     assert float(value) == pytest.approx(30 * math.log(1 + math.exp(-2)), rel=1e-5) == pytest.approx(3.8078, abs=1e-4)
-    scaled = codebook.contrast(rows((30, 5 * X), (30, 0.2 * Y)), ids)  # of directions
+    scaled = codebook.contrast(rows((30, 5 * X), (30, 0.2 * Y)), ids)  # only directions count
     assert float(scaled) == pytest.approx(3.8078, abs=1e-4)
 
 

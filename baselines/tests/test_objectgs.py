@@ -97,7 +97,7 @@ def test_classes_by_three_rules():
         surfels, found.largest()[0], scene.cameras, scene.labels, FAR_APART[-1] + 1, FAR_APART[1:],
         scene.rasterizer, scene.settings, 0, found,
     )  # fmt: skip
-    assert ObjectGsRefiner().members(assigned) is None  # as they are assigned
+    assert ObjectGsRefiner().members(assigned) is None  # labels stay as assigned
     labels = {rule: ObjectGsRefiner(labels=rule).members(assigned).class_ids for rule in ("majority", "nonzero")}
     e6 = assigned.class_ids
     assert torch.equal(labels["nonzero"][e6 != 0], e6[e6 != 0]) and (labels["nonzero"] == 0).sum() < (e6 == 0).sum()

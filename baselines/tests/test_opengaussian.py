@@ -149,7 +149,7 @@ def test_a_cluster_that_hardly_shows_takes_no_step(monkeypatch):
     stepped(training, range(33))
     training.book.occurs[:] = True
     draw, found = training.drawing.draw, []
-    for factor in (0.79, 0.82):  # of 0.99
+    for factor in (0.79, 0.82):  # factors of alpha 0.99
 
         def fainter(*what, factor=factor):
             drawn, alpha = draw(*what)

@@ -289,7 +289,7 @@ def test_a_joint_base_grows_with_the_classes_of_its_seeds(data, tmp_path, monkey
 
 @pytest.mark.parametrize(
     ("name", "step"),
-    # of cob-gs also where the next object begins, and after a checkpoint that follows this
+    # cob-gs is also stopped where the next object begins, and after a checkpoint that follows this.
     [*((name, step) for name in OWN for step in (0, 2, 7)), ("cob-gs", 14), ("cob-gs", 20), ("sagd", 0)],
 )
 def test_a_killed_run_ends_as_the_whole_one(refined, data, tmp_path, monkeypatch, name, step):

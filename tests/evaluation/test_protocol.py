@@ -74,7 +74,7 @@ def test_a_mask_that_is_empty_in_both_is_left_out_and_one_that_should_be_empty_c
     nothing, something = np.zeros((8, 9), bool), np.ones((8, 9), bool)
     assert mask_metrics(nothing, nothing) == mask_metrics(something, something, something) == NO_FIGURES
     assert mask_metrics(something, nothing) == MaskMetrics(0.0, 0.0, 0.0)
-    # of the cup, one mask with half of its pixels found; of the box, one that is empty, in truth and as drawn
+    # The cup has one mask with half of its pixels rendered; the box has one that is empty in truth and rendering.
     views = [EvalView(camera(), None, None, {1: square_mask(*CUP)}), EvalView(camera(), None, None, {2: truth() > 9})]
     x, y, half = CUP
     surfels, ids = scene([(x - half / 2, y, half), FLOOR]), torch.tensor([1, 0], dtype=torch.int32)

@@ -101,7 +101,7 @@ def test_the_nearer_of_two_pictures_decides():
 @pytest.mark.parametrize(
     ("removed", "options"),
     [
-        (None, {}),  # as in every real capture
+        (None, {}),  # all real captures are like this
         ({1: picture()}, {"complete": False}),  # a part of a scene
         ({1: picture()}, {"silhouettes": {2: square_mask(*BOX)}}),  # nobody knows where it was
         ({3: picture()}, {}),  # no such class

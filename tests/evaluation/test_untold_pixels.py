@@ -56,7 +56,7 @@ def test_a_region_that_cannot_be_told_makes_no_boundary():
     """The band of the truth lies along what is surely outside, not along the region; a hole beside it is wrong."""
     truth = extracted_truth(views()["extracted"], 1)
     band = boundary_band(truth.compared().numpy(), 1) & TOLD.numpy()
-    assert band[int(Y - HALF)].any() and not band[int(Y), int(X)]  # along the top, not along the untold half
+    assert band[int(Y - HALF)].any() and not band[int(Y), int(X)]  # the band follows the top, not the untold half
     hole = truth.compared() & ~square_mask(X + 1, Y, 1)
     found = mask_metrics(hole, truth.compared(), truth.unknown)
     wrong = boundary_band(hole.numpy(), 1) & TOLD.numpy()

@@ -266,7 +266,7 @@ def test_what_splat_transform_writes(tmp_path, name, options):
     path = converted(write(tmp_path / "cup.ply", "ply", surfels), tmp_path / name, *options)
     back = read_scene(converted(path, tmp_path / "back.ply")).gaussians
     found = differences(read_scene(path).gaussians, back)
-    if path.suffix == ".spz" and found["means"] > 1:  # since its version 3 it takes the axes of .spz for those of .ply
+    if path.suffix == ".spz" and found["means"] > 1:  # version 3 of it takes the axes of .spz for those of .ply
         turn = torch.tensor([1.0, -1.0, -1.0])
         quats, signs = back.quats * torch.cat([torch.ones(1), turn]), torch.from_numpy(HALF_TURN_SIGNS).float()
         back = replace(back, means=back.means * turn, quats=quats, sh_rest=back.sh_rest * signs[:, None])

@@ -154,7 +154,7 @@ def test_what_hides_below_the_object_or_behind_it_is_shown():
         sheet = object_cells(1, "ball", {"before": ball(), "after": joined(ball(), extra)}, [], front, BALLS)
         (line,) = cells(sheet, LARGEST)
         shares = [black(cell) for cell in line]
-        assert all(share < 0.001 for share in shares[::2])  # before
+        assert all(share < 0.001 for share in shares[::2])  # cells before refinement
         assert all(shares[place + 1] > 0.01 for place in expected), shares
 
 

@@ -54,7 +54,7 @@ def test_cameras_look_at_the_middle_and_the_box_fills_the_widest_picture(elevati
         assert float(torch.linalg.det(rotation)) == pytest.approx(1.0, abs=1e-5)
         above = math.degrees(math.asin(float((camera.center.double() - stand.center) @ stand.up) / stand.distance))
         assert above == pytest.approx(elevation, abs=1e-2)
-        if abs(elevation) < 90:  # up in the world is up in the picture
+        if abs(elevation) < 90:  # the world's up is the picture's up
             (top,), _ = project((stand.center + 0.1 * stand.up)[None], camera)
             assert top[1] < 50 and float(top[0]) == pytest.approx(50.0, abs=1e-3)
     assert max(reach) == pytest.approx(1 / 1.06, rel=1e-3)

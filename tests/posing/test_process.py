@@ -26,7 +26,7 @@ from beags_plugin.system.reading.ply import read_ply_points
 def posed(tmp_path_factory):
     """Return the folder of a scene made by the command from twelve photos, and the true poses."""
     root = tmp_path_factory.mktemp("posed")
-    given = write_photos(root / "photos", prefix="walk 1, ")  # as phones name them
+    given = write_photos(root / "photos", prefix="walk 1, ")  # phones give such names
     main(["process", "--data", str(root / "photos"), "--output-dir", str(root / "scene")])
     return root / "scene", given
 
@@ -73,7 +73,7 @@ def test_a_second_call_computes_nothing_and_another_only_what_is_new(posed, tmp_
     monkeypatch.setattr(features, "_features", lambda *args: computed.append(1) or find_features(*args))
     process(folder / "images", folder, quiet)
     assert (folder / "transforms.json").read_bytes() == before and not computed
-    (folder / REPORT).unlink()  # as a call that was cut off at its very end leaves it
+    (folder / REPORT).unlink()  # a call that was cut off at its very end leaves no report
     given |= {"a": camera(0.75, 2.0), "walk 1, 03": camera(0.5, 2.2)}
     for name in ("a", "walk 1, 03"):
         Image.fromarray(photograph(given[name])).save(folder / f"images/{name}.png")
@@ -100,7 +100,7 @@ def test_a_call_that_was_cut_off_goes_on_to_the_same_poses(posed, tmp_path, monk
 
     monkeypatch.setattr(features, "_features", counting)
     monkeypatch.setattr("beags_plugin.posing.process.match", stop)
-    for _ in range(2):  # at the sixth photo, and before the matches
+    for _ in range(2):  # stops at the sixth photo, and before the matches
         with pytest.raises(KeyboardInterrupt):
             process(photos, folder, quiet)
     monkeypatch.undo()

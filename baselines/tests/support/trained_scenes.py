@@ -18,7 +18,7 @@ from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import render_class_map, surfel_inputs
 
 FAR_APART = (0, 7, 40_000)  # ids of the background and both objects
-FACTOR = 3  # of the pictures' size
+FACTOR = 3  # divisor of the pictures' size
 
 
 def trained_scene(ids: tuple[int, ...] = FAR_APART, steps: int = 3_000, scale: float = 1.0) -> TrainedScene:

@@ -195,7 +195,7 @@ def test_configs_that_come_back_name_the_places_here(tmp_path):
     config = preset_config("beags-tiny", {}, Path("t"))
     config.run_dir, config.load_dir = Path("/node/trials/t/run"), Path("/node/inputs/b/nerfstudio_models")
     config.data_config.dataparser.data = Path("/node/inputs/d")
-    config.data_config.dataparser.masks_path = Path("masks")  # below the data
+    config.data_config.dataparser.masks_path = Path("masks")  # relative to the data
     for folder in ("t/run", "t/run/base"):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / "config.yml").write_text(yaml.dump(config))
