@@ -1,4 +1,4 @@
-"""Refiners that own their training, from a base whose Gaussians and classes are exact: their edits, steps, objects."""
+"""Refiners that own their training start from a base with exact Gaussians and classes: edits, steps, objects."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SURFELS, CLASS_IDS = discs()
 
 @dataclass
 class Refined:
-    """A run, its edits as one, and of each the numbers of Gaussians before, of those gone, and of children after."""
+    """A run, its edits as one, and for each edit the numbers of Gaussians before it, of those gone and of children."""
 
     config: Path
     edited: Densified
@@ -39,7 +39,7 @@ class Refined:
         return {float(each["step"]) for each in state.values()}
 
     def jaccard(self, class_id: int) -> float:
-        """Of the object and the Gaussians that come from its discs."""
+        """Return the Jaccard index of the object and the Gaussians that come from its discs."""
         found, true = read_run(self.config).members.of(class_id), CLASS_IDS[self.edited.source] == class_id
         return int((found & true).sum()) / int((found | true).sum())
 
@@ -85,7 +85,7 @@ def refined(tmp_path_factory):
 
 
 def scene_of(run: Refined) -> tuple[Surfels, Surfels]:
-    """Return the base and the scene in the end."""
+    """Return the base and the final scene."""
     return read_run(run.config.parent / "base/config.yml").surfels(), read_run(run.config).surfels()
 
 
@@ -96,7 +96,7 @@ def test_trace3d_leaves_the_centres_of_those_that_it_does_not_split(refined):
     assert len(after) == len(source) > 60 and 10 <= int(fresh.sum()) <= 20
     assert torch.equal(after.means[~fresh], base.means[source[~fresh]])
     assert not (after.means[fresh] == base.means[source[fresh]]).all(dim=1).any()
-    assert (after.log_scales != base.log_scales[source]).any(dim=1).all(), "all else trains on"
+    assert (after.log_scales != base.log_scales[source]).any(dim=1).all(), "everything else trains on"
     run = refined("trace3d", position_lr="intended")
     base, after = scene_of(run)
     kept = ~run.edited.fresh
@@ -106,7 +106,7 @@ def test_trace3d_leaves_the_centres_of_those_that_it_does_not_split(refined):
 def test_trace3d_splits_prunes_and_takes_the_objects(refined):
     run = refined("trace3d")
     assert len(run.edits) == 5 and run.edits[0][2] >= 10 and run.edits[-1][1:] == (0, 0)
-    assert run.adam_steps == {7.0}, "anew at the start; of 12 steps the five before edits are lost"
+    assert run.adam_steps == {7.0}, "Adam starts anew; five of 12 steps come before edits and are lost"
     members, found = read_run(run.config).members, evaluate_run(run.config)
     assert members.objects is None and [run.jaccard(c) > 0.9 for c in (1, 2)] == [True, True]
     assert found.before is not None and found.before.psnr > found.after.psnr > 30
@@ -117,7 +117,7 @@ def test_cob_gs_cuts_the_objects_in_turn(refined):
     run = refined("cob-gs", epochs=6)
     (first, second, last) = run.edits
     assert first[0] == 75 and first[2] > 20 and second[1] > 0 and second[2] > 0 and last[1] > 0 == last[2]
-    assert run.adam_steps == {14.0}, "anew for the second object"
+    assert run.adam_steps == {14.0}, "Adam starts anew for the second object"
     assert read_run(run.config).members.present() == [0, 1, 2]
     assert all(run.jaccard(c) > 0.8 for c in (1, 2))
     found = evaluate_run(run.config)

@@ -15,7 +15,7 @@ from beags_plugin.system.errors import UserError
 
 
 def with_one_behind(surfels: Surfels) -> Surfels:
-    """The discs and, first of all, one that no view composites: it is far below what they look at."""
+    """Return the discs, and before them one that no view composites because it is far below."""
     hidden = surfels[:1].clone()
     hidden.means[:] = torch.tensor([[0.0, 0.0, -50.0]])
     return Surfels(*(torch.cat(pair) for pair in zip(vars(hidden).values(), vars(surfels).values(), strict=True)))
@@ -23,11 +23,11 @@ def with_one_behind(surfels: Surfels) -> Surfels:
 
 @pytest.mark.parametrize("weights", ["count", "alpha"])
 def test_hidden_gaussians_count_whole_pixels_unless_weights_count(weights):
-    """Only counts see that a disc shows behind others: no weight there is worth a split."""
+    """Only counts see that a disc shows behind others, where weights are too small for a split."""
     held = OwnedScene(surfels=with_one_behind(discs()[0]), steps=1_000)
     members = held.run(Trace3DRefiner(weights=weights)).finish()
     edits = [edit.edited for edit in held.edits if edit.edited is not None]
-    assert held.edits[0].fresh_adam and len(edits) == 5  # the first step and the first cycle are one; the last prunes
+    assert held.edits[0].fresh_adam and len(edits) == 5  # the first step and cycle coincide; the last prunes
     assert 0 not in edits[0].source.tolist(), "nobody sees it"
     assert bool(edits[0].fresh.any()) == (weights == "count")
     assert members is not None and members.objects is None and members.present() == [0, 1, 2]

@@ -40,12 +40,12 @@ def trained(steps: int = 0, scene: TrainedScene | None = None, **options) -> Cod
 
 
 def gradients(training: CodebookTraining, name: str) -> tuple[torch.Tensor | None, torch.Tensor | None]:
-    """Of the codes and of the codebook by one term of a step; the scene has none."""
+    """Return the gradients that one term gives to the codes and to the codebook; the scene gets none."""
     terms = training.terms(loss_inputs(training.scene, 2), 2, dict)
     found = torch.autograd.grad(
         terms[name], [*training.learned.parameters, *vars(training.scene.surfels()).values()], allow_unused=True
     )
-    assert all(values is None for values in found[2:]), "means, scales, opacities, .. get nothing at all"
+    assert all(values is None for values in found[2:]), "the scene gets nothing at all"
     return found[0], found[1]
 
 
@@ -84,7 +84,7 @@ def test_weights_and_rates(monkeypatch):
 
 
 def test_a_view_that_is_right_has_no_term_of_classes():
-    """Each Gaussian has the code of its class, so that the largest code of a pixel is that of its mask."""
+    """Each Gaussian has the code of its class, so the largest code of a pixel is that of its mask."""
     training = trained()
     ranks = training.ranks.ranks(training.scene.class_ids()).long()
     with torch.no_grad():
@@ -97,7 +97,7 @@ def test_a_view_that_is_right_has_no_term_of_classes():
 
 
 def test_pixels_that_are_not_reliable_teach_no_code(monkeypatch):
-    """What they would be worth changes no term of the codebook; those of codes take all."""
+    """Only reliable pixels count in the terms of the codebook; all count in those of codes."""
     training, counted = trained(), torch.zeros(0, dtype=torch.bool)
 
     def terms(chosen: slice) -> dict[str, float]:
@@ -132,7 +132,7 @@ def test_a_step_without_mask_leaves_all_as_it_is():
 
 
 def test_unlabelled_pixels_enter_no_term():
-    """What lies under them may be any class."""
+    """Anything may lie under them."""
     scene = trained_scene()
     hidden = torch.zeros_like(scene.labels[0], dtype=torch.bool)
     hidden[:, ::3] = True
@@ -196,7 +196,7 @@ def test_a_restored_run_goes_on_alike():
 
 
 def test_two_opaque_dots_in_front_of_a_wall():
-    """Masks are the pixels of the dots; each gets its own object, the wall none."""
+    """Each dot has a mask and becomes an object; the wall has none and becomes none."""
     size, wide = 9, 1e3
     inputs = discs(size, [(2.5, 4.5), (6.5, 4.5), (4.5, 4.5)], 0.4, [0.95, 0.95, 0.95], [1.0, 1.0, 2.0])
     inputs.log_scales[2] = torch.tensor(wide).log()

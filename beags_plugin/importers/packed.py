@@ -68,10 +68,10 @@ def gaussians_of(
         raise ValueError("its Gaussians have not as many places as rotations, scales, opacities or colours")
     rest = rest[:, : num_sh_bases(MAX_DEGREE) - 1]
     logits = torch.logit(torch.from_numpy(np.ascontiguousarray(alphas, dtype=np.float64))).float()
-    means, quats, log_scales, dc, rest = (
+    tensors = [
         torch.from_numpy(np.ascontiguousarray(each, dtype=np.float32)) for each in (means, quats, log_scales, dc, rest)
-    )
-    return Gaussians(means, quats, log_scales, logits, dc, rest)
+    ]
+    return Gaussians(*tensors[:3], logits, *tensors[3:])
 
 
 def with_largest(three: np.ndarray, place: np.ndarray) -> np.ndarray:

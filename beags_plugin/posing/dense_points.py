@@ -60,7 +60,9 @@ def dense_points(
         shades.append(color[pixels])
         weights.append(weight)
         distances.append(np.linalg.norm(place - photo.center, axis=1))
-    return _thinned(*map(np.concatenate, (places, shades, weights, distances)), count)
+    return _thinned(
+        np.concatenate(places), np.concatenate(shades), np.concatenate(weights), np.concatenate(distances), count
+    )
 
 
 def _neighbours(
