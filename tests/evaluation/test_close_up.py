@@ -1,4 +1,4 @@
-"""Objects scored at the size of the photos' files: only their box is drawn, and finer than what is trained on."""
+"""Objects are scored at the size of the photos' files, and only their box is drawn."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from beags_plugin.evaluation.run_metrics import evaluate_scene
 from beags_plugin.evaluation.table import render_run
 from beags_plugin.labels.class_ids import IGNORE
 
-FINE = 4  # times as large as what is trained on
+FINE = 4  # files of photos are so many times as large as training photos
 IDS = torch.tensor([1, 2, 0], dtype=torch.int32)
 
 
 class FineSquares(Squares):
-    """The squares of ``Squares`` at the scale and place of the camera."""
+    """``Squares`` at the scale and place of the camera."""
 
     def __init__(self) -> None:
         self.sizes: list[tuple[int, int]] = []
@@ -44,7 +44,7 @@ def fine(mask: torch.Tensor) -> torch.Tensor:
 
 
 def view(photo: torch.Tensor | None = None, **options) -> EvalView:
-    """Return a view whose photo's file is ``FINE`` times as large; photo: that, else what the scene shows."""
+    """Return a view whose photo has a file ``FINE`` times as large; the photo is what the scene shows unless given."""
     small = camera()
     full = replace(small, K=small.K * torch.tensor([FINE, FINE, 1.0])[:, None], width=FINE * SIZE, height=FINE * SIZE)
     photo = torch.full((FINE * SIZE, FINE * SIZE, 3), 0.3) if photo is None else photo

@@ -1,4 +1,4 @@
-"""Figures of a run, their table and JSON, on scenes of a stand-in rasterizer whose masks are known."""
+"""Figures of a run, their table and JSON; a stand-in rasterizer draws known masks."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_perfect_scene_scores_one():
 
 
 def test_a_stray_gaussian_costs_what_it_covers():
-    """A floor Gaussian of 4x4 pixels is labelled cup: extracted IoU 64 / 80, rendered IoU 1, as the floor hides it."""
+    """A floor Gaussian of 4x4 pixels is labelled cup; only the extracted mask shows it, as the floor hides it."""
     view = EvalView(camera(), None, truth(), {1: square_mask(*CUP), 2: square_mask(*BOX)})
     metrics = evaluated([CUP, BOX, FLOOR, STRAY], [1, 2, 0, 1], view)
     cup = metrics.objects[1]
@@ -58,7 +58,7 @@ def test_a_stray_gaussian_costs_what_it_covers():
 
 
 def test_only_labelled_objects_are_scored():
-    """Only the cup's visible mask is known: the box is not scored, though it is seen; the id image does not count."""
+    """Only the cup's visible mask is known, so the box that is seen and the id image do not count."""
     wrong = torch.full((SIZE, SIZE), 2, dtype=torch.int32)
     metrics = evaluated([CUP, BOX, FLOOR], IDS, EvalView(camera(), None, wrong, visible_objects={1: square_mask(*CUP)}))
     assert metrics.objects == {1: metrics.mean, 2: ObjectMetrics(None, None)}
@@ -84,9 +84,9 @@ def test_what_is_drawn_before_another_object_counts_as_wrong():
 
 @pytest.mark.parametrize("gap", [0.003, 0.1])
 def test_layers_of_the_object_itself_hide_nothing(gap):
-    """A haze of the box lies before two layers of the cup, which the whole scene draws where the truth says box.
+    """A haze of the box lies before two layers of the cup, and the truth says box everywhere.
 
-    In the whole scene the surface is the cup's first layer, of the cup alone the second: nearer, but not hidden.
+    The surface of the whole scene is the cup's first layer, that of the cup alone its second.
     """
     depths, opacities = torch.tensor([1.0 - gap, 1.0, 1.0 + gap, 2.0]), torch.tensor([0.2, 0.45, 0.45, 0.99])
     surfels = Surfels.of(

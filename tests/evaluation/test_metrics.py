@@ -18,7 +18,7 @@ def mask(*rows: str) -> np.ndarray:
 
 
 def brute_erode(image: np.ndarray, times: int) -> np.ndarray:
-    """Return the definition, word for word: 3x3, repeated, False outside."""
+    """Erode as the definition says: by 3x3, repeatedly, with False outside."""
     for _ in range(times):
         out = np.zeros_like(image)
         for i in range(image.shape[0]):
@@ -53,7 +53,7 @@ def test_ignored_pixels_leave_every_count():
     ignore = mask("..#.", "....", "....", "...#")
     assert mask_metrics(predicted, truth, ignore) == MaskMetrics(1.0, 1.0, 1.0, 0.0)
     assert mask_metrics(predicted, truth).iou == 4 / 6
-    assert mask_metrics(predicted, truth).spill == 1 / 4  # the far corner; the pixel beside the mask is within d = 1
+    assert mask_metrics(predicted, truth).spill == 1 / 4  # only the far corner is further than d = 1
 
 
 def test_covered_is_what_a_mask_lacks():
@@ -66,7 +66,7 @@ def test_covered_is_what_a_mask_lacks():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_spill_is_what_lies_beyond_the_margin(seed):
-    """By definition, pixel by pixel: further than d from every pixel of the truth, both of counted pixels only."""
+    """The definition, pixel by pixel: counted pixels further than d from every pixel of the truth."""
     generator = np.random.default_rng(seed)
     truth, predicted = np.zeros((40, 60), bool), generator.random((40, 60)) < 0.3
     truth[12:20, 20:33] = True

@@ -85,7 +85,7 @@ def test_a_mask_that_is_empty_in_both_is_left_out_and_one_that_should_be_empty_c
 
 
 class Ramp(Squares):
-    """Everything has alpha, and colour, growing from 0 at the left to 1 at the right."""
+    """Alpha and colour grow from 0 at the left to 1 at the right."""
 
     def rasterize(self, inputs, camera, settings, background, target=None):
         drawn = super().rasterize(inputs, camera, settings, background)
@@ -108,7 +108,7 @@ def test_the_threshold_cuts_both_kinds(threshold):
 
 def test_what_no_photo_shows_is_scored_and_the_rest_stands_beside_it():
     known = square_mask(*CUP)
-    known[:, : int(CUP[0])] = False  # the left half is not known, and not there
+    known[:, : int(CUP[0])] = False  # the left half is neither known nor drawn
     view = EvalView(camera(), None, None, {1: square_mask(*CUP)}, seen={1: known})
     x, y, half = CUP
     surfels, ids = scene([(x + half / 2, y, half / 2), BOX]), torch.tensor([1, 2], dtype=torch.int32)

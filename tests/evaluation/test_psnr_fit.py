@@ -1,4 +1,4 @@
-"""PSNR after the best affine colour fit: what exposure and white balance alone change costs nothing."""
+"""PSNR after the best affine colour fit, where exposure and white balance cost nothing."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def evaluated(photo: torch.Tensor, **options) -> SceneMetrics:
 
 
 def warm_photo() -> torch.Tensor:
-    """Return what is drawn, darker and warmer."""
+    """Return the drawn picture, darker and warmer."""
     photo = torch.zeros(SIZE, SIZE, 3)
     for square, color in zip((FLOOR, BOX, CUP), COLORS.flip(0), strict=True):
         photo[square_mask(*square)] = color * torch.tensor([0.8, 0.6, 0.4]) + 0.05
@@ -59,7 +59,7 @@ def test_parts_of_images_are_scored_after_the_fit_where_exposures_were_learned(f
 
 
 def test_objects_trained_alone_are_fitted_by_their_own_pixels():
-    """What is drawn outside of them was never compared with the photo."""
+    """Pixels outside of them were never compared with the photo."""
     photo, other = warm_photo(), 1 - warm_photo()
     photo = torch.where((truth() > 0)[..., None], photo, other)
     metrics = evaluated(photo, objects_alone=True, colors_fitted=True)

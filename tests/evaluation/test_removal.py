@@ -1,4 +1,4 @@
-"""What is left after an object is taken out, on opaque squares whose every pixel is known."""
+"""Remains after an object is taken out, on opaque squares whose every pixel is known."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PIECE = (6.0, 10.0, 2.0)  # a quarter of the cup, before it
 
 
 def picture(*squares: tuple[float, float, float], objects: float = HIGH) -> torch.Tensor:
-    """Return [H, W, 3] with these squares on the floor."""
+    """Return [H, W, 3], the squares on the floor."""
     drawn = torch.full((SIZE, SIZE, 3), LOW)
     for square in squares:
         drawn[square_mask(*square)] = objects
@@ -74,7 +74,7 @@ def test_figures_of_one_object(squares, ids, taken, psnr, remains):
 
 
 def test_what_photos_show_is_scored_apart():
-    """The piece that stays lies in the cup's half that photos show behind it, at twice the size of the pictures."""
+    """A piece stays in the half of the cup behind which photos see; that mask is twice as large as the pictures."""
     half = (square_mask(*CUP) & square_mask(*PIECE[:2], 4.0)).repeat_interleave(2, 0).repeat_interleave(2, 1)
     for known, psnr, share in ((half, decibels(16, 36), 36 / 64), (half & False, None, 0.0), (None, None, None)):
         known = None if known is None else {1: known}
@@ -91,7 +91,7 @@ def test_pixels_that_do_not_tell_are_no_remains():
 
 
 def test_the_nearer_of_two_pictures_decides():
-    """A rendering between the two: 40 % of the object over the floor show nothing, 60 % show the object."""
+    """The object over the floor counts as gone at an opacity of 40 % and as there at 60 %."""
     for share, remains in ((0.4, 0.0), (0.6, 1.0)):
         objects = LOW + share * (HIGH - LOW)
         removal = evaluated([CUP], (0,), {1: picture()}, picture(CUP), objects=objects).mean.removal
@@ -126,12 +126,12 @@ def printed(table) -> str:
 
 
 def exposed(picture: torch.Tensor) -> torch.Tensor:
-    """Return a picture as a photo of less light and another white balance records it."""
+    """Return a picture with less light and another white balance."""
     return picture * torch.tensor([0.5, 0.6, 0.7]) + 0.3
 
 
 def test_of_learned_exposures_the_photos_own_is_taken_off_before_remains_are_told():
-    """The fit is that of the whole rendering, so that what stays is not fitted away."""
+    """The fit is that of the whole rendering, so that remains are not fitted away."""
     photo, rest = exposed(picture(PIECE, CUP)), {1: exposed(picture())}
     plain = evaluated([PIECE, CUP], (1, 1), rest, photo)
     fitted = evaluated([PIECE, CUP], (1, 1), rest, photo, colors_fitted=True)
@@ -139,7 +139,7 @@ def test_of_learned_exposures_the_photos_own_is_taken_off_before_remains_are_tol
     assert fitted.mean.removal.ssim > 0.9999 > plain.mean.removal.ssim
     assert fitted.mean.removal.remains == 0.0
     assert fitted.psnr == plain.psnr < 20 and fitted.psnr_fit == plain.psnr_fit > 80
-    # What stays is told as without the exposure.
+    # Remains are told as without the exposure.
     stays = evaluated([PIECE, CUP], (0, 1), rest, photo, colors_fitted=True).mean.removal
     assert stays.remains == 16 / 64 and stays.psnr == pytest.approx(decibels(16, 64) + 4.4, abs=0.5)
     nothing = evaluated([CUP], (0,), rest, exposed(picture(CUP)), colors_fitted=True).mean.removal

@@ -31,7 +31,7 @@ def on_disc(x: float, y: float) -> bool:
 
 
 def is_shown(view: float, column: int, row: int, training: dict[float, int], disc: bool = True) -> bool:
-    """Cast the ray of a pixel, and look at what it meets from each training view (place: width of its picture)."""
+    """Cast the ray of a pixel and see whether a training view (place: width of its picture) shows what it meets."""
     dx, dy = (column + 0.5 - WIDTH / 2) / FOCAL, (row + 0.5 - HEIGHT / 2) / FOCAL
     depth = DISC if disc and on_disc(view + DISC * dx, DISC * dy) else WALL
     x, y = view + depth * dx, depth * dy
@@ -63,7 +63,7 @@ def test_what_training_views_show(rasterizer, training):
 
 @pytest.mark.parametrize(("by", "shown"), [(0.5 * TAU, True), (2 * TAU, False)])
 def test_how_far_depths_may_differ(rasterizer, by, shown):
-    """A veil stands between a wall and a training view, but not the held-out one: near the wall, it is the wall."""
+    """A veil stands before a wall in a training view, not in the held-out one; close to it, it counts as the wall."""
     means = torch.tensor([[0.0, 0.0, WALL], [0.0, 0.0, WALL * (1 - by)]])
     quats, sizes = torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1), torch.tensor([40.0, 0.2])
     opacity = torch.full((2,), 6.0)

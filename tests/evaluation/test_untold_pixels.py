@@ -1,4 +1,4 @@
-"""Pixels of which cannot be told whether they are the object's count nowhere, whatever is drawn there."""
+"""Pixels that may or may not be the object's count nowhere, whatever is drawn there."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def evaluated(view: EvalView, squares, ids, **options) -> SceneMetrics:
 
 
 def views() -> dict[str, EvalView]:
-    """Return the same cup, half of which cannot be told, as truth of each kind."""
+    """Return a truth of each kind for a cup whose left half cannot be told."""
     cup, unknown = {1: TOLD}, {1: UNTOLD}
     return {
         "extracted": EvalView(camera(), None, silhouettes=cup, unknown_silhouettes=unknown),
@@ -42,7 +42,7 @@ def views() -> dict[str, EvalView]:
 
 @pytest.mark.parametrize("kind", ["extracted", "seen", "rendered"])
 def test_what_is_drawn_there_changes_no_figure(kind):
-    """A cup drawn without its untold half, with a quarter of it and with all of it: each is right."""
+    """A cup is right without its untold half, with a quarter of it and with all of it."""
     untold = [(x - HALF, y, half) for x, y, half in QUARTERS]
     for squares in (QUARTERS, [*QUARTERS, untold[0]], [*QUARTERS, *untold]):
         cup = getattr(evaluated(views()[kind], squares, [1] * len(squares)).objects[1], kind)
@@ -53,7 +53,7 @@ def test_what_is_drawn_there_changes_no_figure(kind):
 
 
 def test_a_region_that_cannot_be_told_makes_no_boundary():
-    """The band of the truth lies along what is surely outside, not along the region; a hole beside it is wrong."""
+    """The band of the truth lies along sure outside, not along the region; a hole beside the region is wrong."""
     truth = extracted_truth(views()["extracted"], 1)
     band = boundary_band(truth.compared().numpy(), 1) & TOLD.numpy()
     assert band[int(Y - HALF)].any() and not band[int(Y), int(X)]  # the band follows the top, not the untold half
@@ -62,11 +62,11 @@ def test_a_region_that_cannot_be_told_makes_no_boundary():
     wrong = boundary_band(hole.numpy(), 1) & TOLD.numpy()
     assert found.biou == (wrong & band).sum() / (wrong | band).sum() < 1.0
     plain = mask_metrics(hole, truth.mask, truth.unknown)
-    assert plain.biou != found.biou  # where the region counted as outside, the hole would reach a boundary
+    assert plain.biou != found.biou  # if the region counted as outside, the hole would reach a boundary
 
 
 def test_spill_keeps_away_from_what_may_be_the_object():
-    """A stray square spills whole; half of it beside an untold region of two pixels; nothing in such a region."""
+    """A stray square spills whole, by half beside a small untold region, and not at all within one."""
     x, y, _ = STRAY
     for untold, spilled in ((UNTOLD, 4), (square_mask(x - 2, y, 1.0), 2), (square_mask(*STRAY), 0)):
         view = EvalView(camera(), None, silhouettes={1: TOLD}, unknown_silhouettes={1: untold})
@@ -75,7 +75,7 @@ def test_spill_keeps_away_from_what_may_be_the_object():
 
 
 def test_an_untold_pixel_of_another_object_may_hide_this_one():
-    """The box stands whole behind a cup that is told, or that cannot be told, or that no mask speaks of."""
+    """A whole box stands behind a cup that is known, that cannot be told, or that has no mask."""
     cup = square_mask(*CUP)
     box = square_mask(*BOX) & ~cup
     known = EvalView(camera(), None, visible_objects={1: cup, 2: box})

@@ -1,4 +1,4 @@
-"""Files of any origin: what is read, what is dropped, and what is refused before anything of its size is made."""
+"""Scenes to start from: what is read, what is dropped, and what is refused before its size is allocated."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_odd_values_are_recognised():
     given = gaussians(6)
     given.means[0, 1], given.sh_rest[1, 3, 2], given.log_scales[2, 0] = torch.nan, torch.inf, -torch.inf
     given.quats[3] = 0.0
-    given.opacity_logits[4] = torch.inf  # what a converter writes for "opaque"
+    given.opacity_logits[4] = torch.inf  # converters write this for "opaque"
     assert given.usable().tolist() == [False, False, False, False, True, True]
     assert flatten(given)[0].opacity_logits[4] == 30.0
 
@@ -99,7 +99,7 @@ def test_odd_values_are_recognised():
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_the_colour_of_a_moved_scene_is_what_it_was_from_every_side(degree):
-    """Seen from a camera that moves along, in float64, where the turned bands are exact."""
+    """A camera moves along; in float64 the turned bands are exact."""
     surfels = random_surfels(degree=degree, dtype=torch.float64)
     rotation, shift, scale = a_rotation(degree), torch.tensor([0.5, -2.0, 3.0], dtype=torch.float64), 0.37
     moved = from_input_frame(surfels, torch.cat([rotation, shift[:, None]], dim=1), scale)

@@ -1,4 +1,4 @@
-"""Splat files of each format, of ours and of other programs: what is read, what is said of it, what is refused."""
+"""Splat files of each format, ours and those of other programs: what is read, remarked and refused."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ C0 = 0.28209479177387814
 
 
 def columns(surfels: Surfels, **changes: np.ndarray | None) -> dict[str, np.ndarray]:
-    """The columns that 3DGS writes, as changed; None leaves one out."""
+    """Return the columns that 3DGS writes, with changes; None leaves one out."""
     found = {}
     for names, values in (
         (["x", "y", "z"], surfels.means),
@@ -175,7 +175,7 @@ def test_a_scale_of_0_is_a_disc(tmp_path):
 
 
 def in_units(factor: float) -> Surfels:
-    """Discs in another unit of length; their logs are positive where it is small."""
+    """Return discs in another unit of length; a small unit makes the logs positive."""
     surfels = random_surfels(count=400)
     shift = float(np.log(factor))
     return Surfels(
@@ -224,7 +224,7 @@ OURS = [
 
 
 def sorted_by_place(scene: Gaussians | Surfels) -> Gaussians | Surfels:
-    """Two readings of one scene in the same order, whichever its writer chose; places differ by less than 0.01."""
+    """Sort by place, so that two readings of one scene have the same order; places differ by less than 0.01."""
     return scene[torch.from_numpy(np.lexsort(scene.means.mul(20).round().T.numpy()))]
 
 
@@ -266,7 +266,7 @@ def test_what_splat_transform_writes(tmp_path, name, options):
     path = converted(write(tmp_path / "cup.ply", "ply", surfels), tmp_path / name, *options)
     back = read_scene(converted(path, tmp_path / "back.ply")).gaussians
     found = differences(read_scene(path).gaussians, back)
-    if path.suffix == ".spz" and found["means"] > 1:  # version 3 of it takes the axes of .spz for those of .ply
+    if path.suffix == ".spz" and found["means"] > 1:  # its version 3 takes the axes of .spz for those of .ply
         turn = torch.tensor([1.0, -1.0, -1.0])
         quats, signs = back.quats * torch.cat([torch.ones(1), turn]), torch.from_numpy(HALF_TURN_SIGNS).float()
         back = replace(back, means=back.means * turn, quats=quats, sh_rest=back.sh_rest * signs[:, None])
@@ -309,7 +309,7 @@ def test_what_the_reference_library_of_spz_writes(tmp_path, version, degree):
     assert scene.kind == f".spz version {version}" and scene.gaussians.sh_rest.shape == surfels.sh_rest.shape
     found = differences(scene.gaussians, surfels)
     limits = {"means": 1e-3, "log_scales": 1 / 30, "sh_dc": 0.02, "sh_rest": 0.01, "alphas": 0.003}
-    limits["angles"] = 20 if version == 2 else 0.25  # where w is small, 8 bits of the others leave little of it
+    limits["angles"] = 20 if version == 2 else 0.25  # 8 bits of the others leave little of a small w
     assert all(value <= limits[key] for key, value in found.items()), found
 
 
@@ -330,7 +330,7 @@ def test_a_splat_file_by_hand(tmp_path):
 
 
 def test_a_version_2_spz_by_hand(tmp_path):
-    """A byte each of x, y and z of the rotation, which the reference library no longer writes by itself."""
+    """The rotation has a byte each for x, y and z, which the reference library no longer writes by itself."""
     place = (1 << 20).to_bytes(3, "little") + (-(1 << 19)).to_bytes(3, "little", signed=True) + bytes(3)
     parts = [place, b"\x80", b"\x80\xa6\x00", bytes([128, 176, 49]), bytes([204, 128, 128])]
     header = struct.pack("<IIIBBBB", 0x5053474E, 2, 1, 0, 20, 0, 0)
@@ -383,7 +383,7 @@ def cut(path: Path) -> bytes:
             "names the file '../b'",
         ),
     ],
-    ids=lambda value: value if isinstance(value, str) else "",  # not of bytes, in which gzip writes the time
+    ids=lambda value: value if isinstance(value, str) else "",  # bytes would not do: gzip writes the time into them
 )
 def test_a_damaged_file_is_refused_in_one_sentence(tmp_path, name, content, words):
     (tmp_path / name).write_bytes(content)
@@ -401,27 +401,25 @@ def test_a_file_that_is_cut_off_is_refused(tmp_path, kind, name, bounds):
         read_scene(path)
 
 
-def test_images_of_a_sog_that_do_not_fit_are_refused(tmp_path):
-    path = write(tmp_path / "scene.sog", "sog", random_surfels(count=30))
-    with zipfile.ZipFile(path) as archive:
-        files = {name: archive.read(name) for name in archive.namelist()}
-    meta = json.loads(files["meta.json"])
-    files["meta.json"] = json.dumps(meta | {"count": 1000}).encode()
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, content in files.items():
-            archive.writestr(name, content)
-    with pytest.raises(UserError, match="of 1000 pixels"):
-        read_scene(path)
-
-
 def change_sog(path: Path, change) -> None:
-    """Write the files of a .sog anew, as ``change`` leaves them, packed once more."""
+    """Pack a .sog anew after ``change`` has edited its files."""
     with zipfile.ZipFile(path) as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
     change(files)
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in files.items():
             archive.writestr(name, content)
+
+
+def with_count(meta: bytes, count: int) -> bytes:
+    return json.dumps(json.loads(meta) | {"count": count}).encode()
+
+
+def test_images_of_a_sog_that_do_not_fit_are_refused(tmp_path):
+    path = write(tmp_path / "scene.sog", "sog", random_surfels(count=30))
+    change_sog(path, lambda files: files.update({"meta.json": with_count(files["meta.json"], 1000)}))
+    with pytest.raises(UserError, match="of 1000 pixels"):
+        read_scene(path)
 
 
 def white(side: int) -> bytes:
@@ -440,9 +438,7 @@ def white(side: int) -> bytes:
         (lambda files: files.update({"quats.webp": bytes(50_000_000)}), "quats.webp unpacks to more than"),
         (lambda files: files.update({"quats.webp": white(2000)}), "has 2000 x 2000 pixels"),
         (
-            lambda files: files.update(
-                {"meta.json": json.dumps(json.loads(files["meta.json"]) | {"count": 10**9}).encode()}
-            ),
+            lambda files: files.update({"meta.json": with_count(files["meta.json"], 10**9)}),
             "promises 1000000000 Gaussians, which do not fit",
         ),
     ],

@@ -1,4 +1,4 @@
-"""The contact sheet: no cell is empty, objects have the photos' pixels, and no side hides what went wrong."""
+"""The contact sheet has no empty cell, shows objects with the photos' pixels, and hides no side that went wrong."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def photos(elevation: float = 20.0, turn: float = 360.0, count: int = 8, pixels:
 
 
 def views(*, full: int = 1) -> list[EvalView]:
-    """Return views of a ball from around; full: how much larger the photos' files are."""
+    """Return views around a ball; ``full`` says how much larger the photos' files are."""
     found = []
     generator = torch.Generator().manual_seed(0)
     for number, seen in enumerate(photos(count=4)):
@@ -131,7 +131,7 @@ def test_lines_of_objects_of_different_size_end_together():
 
 
 def _colours(row: np.ndarray) -> bytes:
-    """Return the pixels of a row but the white ones, which lie beside the photo."""
+    """Return the pixels of a row without the white ones, which lie beside the photo."""
     return row[(row < 255).any(axis=1)].tobytes()
 
 

@@ -29,7 +29,7 @@ def ball(color: float = 1.0, count: int = 200) -> Surfels:
     z = 1 - 2 * step / count
     angle, radius = step * 2.399963, torch.sqrt(1 - z * z)
     means = torch.stack([radius * torch.cos(angle), radius * torch.sin(angle), z], dim=1)
-    half = means + torch.tensor([0.0, 0.0, 1.0])  # the quaternion that turns z to the mean
+    half = means + torch.tensor([0.0, 0.0, 1.0])  # its quaternion turns z to the mean
     quats = torch.stack([1 + z, -half[:, 1] + 0.0, half[:, 0], torch.zeros(count)], dim=1)
     dc = torch.full((count, 3), (color - 0.5) / 0.28209479177387814)
     return Surfels(means, quats, torch.full((count, 2), -2.0), torch.full((count,), 5.0), dc, torch.zeros(count, 0, 3))

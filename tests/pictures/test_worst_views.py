@@ -1,4 +1,4 @@
-"""The picture of the worst masks: their ranking, and the colour at each pixel."""
+"""The picture of the worst masks: their ranking and the colour at each pixel."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ GREY = 100
 
 
 def evaluated(protocol: Protocol | None = None):
-    """Evaluate a cup that assignment puts two pixels off and refinement puts right; in view 1 no box hides it."""
+    """Evaluate a cup that refinement moves back by two pixels; in view 1 no box hides it."""
     protocol = protocol or Protocol()
     ids = Membership(torch.tensor([1, 2, 0], dtype=torch.int32))
     before, after = scene([SHIFTED, BOX, FLOOR]), scene([CUP, BOX, FLOOR])

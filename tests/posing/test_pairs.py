@@ -14,7 +14,7 @@ def unit(rows: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def walk():
-    """Return descriptors of 40 photos: each shows 20 things of a row of 240, six of them new."""
+    """Return descriptors of 40 photos, each of which shows 20 things of a row, six of them new."""
     generator = np.random.default_rng(0)
     things = generator.random((260, 128)) ** 4
     shown = [things[6 * photo : 6 * photo + 20] for photo in range(40)]

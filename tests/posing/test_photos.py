@@ -1,4 +1,4 @@
-"""Photos as cameras and phones store them: on their side, with a focal length, with other files around."""
+"""Photos as cameras and phones store them: turned, with a focal length, and among other files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ EXIF_IFD = 0x8769
 
 
 def save(path, picture, turned=1, focal=None):
-    """Write a photo whose EXIF tells how it is turned, and the focal length on film of 35 mm."""
+    """Write a photo whose EXIF tells its turn and its focal length on film of 35 mm."""
     image = Image.fromarray(picture)
     exif = image.getexif()
     exif[ExifTags.Base.Orientation] = turned

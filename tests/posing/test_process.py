@@ -1,4 +1,4 @@
-"""Photos of a known scene, through ``beags process``: its poses, its files, and what it says and keeps."""
+"""Photos of a known scene go through ``beags process``: poses, files, notes, and what it keeps."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_ns_train_reads_the_scene(posed):
 
 
 def test_a_second_call_computes_nothing_and_another_only_what_is_new(posed, tmp_path, monkeypatch):
-    """Photos may be added, also before the known ones in order, changed under their names, and left out."""
+    """Photos may be added anywhere in their order, changed under their names, and left out."""
     folder, given = tmp_path / "scene", dict(posed[1])
     shutil.copytree(posed[0], folder)
     before = (folder / "transforms.json").read_bytes()
@@ -162,7 +162,7 @@ def test_on_a_turntable_masks_find_the_poses_of_what_turns(tmp_path, capsys):
         write_image(photos / f"{name}.png", photo)
         write_image(scene / f"masks/{name}.png", np.where(inside == 1, 1, 255).astype(np.uint8))
     arguments = ["process", "--data", str(photos), "--output-dir", str(scene)]
-    with pytest.raises(SystemExit):  # what most features say is that no camera moved
+    with pytest.raises(SystemExit):  # most features say that no camera moved
         main(arguments)
     main([*arguments, "--masks", str(scene / "masks"), "--ignore-ids", "255"])
     assert "--pipeline.datamanager.photos objects beags-data --ignore-ids 255" in " ".join(

@@ -1,4 +1,4 @@
-"""Frames of videos: which are taken, as they are to be shown, and the poses of a camera that films."""
+"""Frames of videos: which are taken, how they are turned, and the poses of the camera."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_a_video_gives_the_poses_of_its_camera_and_is_decoded_once(tmp_path, mon
 
 @pytest.mark.parametrize(("matrix", "turns"), [((0, 1, -1, 0), 1), ((-1, 0, 0, -1), 2), ((0, -1, 1, 0), 3)])
 def test_the_frames_of_a_turned_phone_are_upright(tmp_path, matrix, turns):
-    """Phones store what the sensor sees, and how to turn it."""
+    """Phones store the frames of the sensor and how to turn them."""
     shown = [photograph(camera(float(angle)), turned=turns != 2) for angle in ANGLES[::3]]
     video = film(tmp_path / "phone.mp4", [np.rot90(each, turns) for each in shown])
     content = bytearray(video.read_bytes())

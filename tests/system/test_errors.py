@@ -1,4 +1,4 @@
-"""A user error is one sentence, also in programs that are not ours."""
+"""A user error prints one sentence, also in programs of others."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ try:
     EventFileWriter(sys.argv[1])
 except OSError:
     print("handed on")
-for thread in threading.enumerate():  # what it prints comes after that
+for thread in threading.enumerate():  # it prints only afterwards
     if thread is not threading.main_thread():
         thread.join(30)
 """
@@ -87,7 +87,7 @@ def test_what_a_disk_refuses_is_reported_with_the_path(tmp_path, code):
 
 
 def test_mistakes_in_the_program_blame_no_path(tmp_path):
-    """Errors of the system's kind too: a closed pipe, a closed file, a picture of a kind that cannot be saved."""
+    """Some are of the system's kind too: a closed pipe, a closed file, a picture that cannot be saved."""
     pipe, closed = refusal(errno.EPIPE), refusal(errno.EBADF)
     for cause in (KeyError("x"), pipe, closed, OSError("cannot write mode F as PNG"), refusal(errno.EINVAL)):
         assert error_in(tmp_path / "a.png", cause) is cause

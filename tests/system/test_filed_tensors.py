@@ -86,7 +86,7 @@ def test_a_full_disk_is_reported(monkeypatch):
 
 
 class _FullDisk(io.RawIOBase):
-    """Every byte that is really written fails, when the buffer is flushed and when the file is closed."""
+    """Writing bytes fails, both when the buffer is flushed and when the file is closed."""
 
     def writable(self):
         return True
@@ -115,7 +115,7 @@ def test_what_could_not_be_written_leaves_nothing_behind(tmp_path):
 
 
 class Counting:
-    """Views of which no more than a few may be held at a time."""
+    """Views that count how many of them are held at a time."""
 
     def __init__(self, make, count):
         self.make, self.count, self.alive, self.most = make, count, [], 0
@@ -140,7 +140,7 @@ def test_the_voxel_form_holds_one_view_at_a_time():
     lazy = Counting(lambda index: depths[index].clone(), len(depths))
     maps = Counting(lambda index: masks[index % 3].clone(), 9)
     found = [(each.labels, each.confidence) for each in reproject_voxel(lazy, cameras, masks, CLASSES)]
-    assert lazy.most <= 3  # a loop over a zip holds the last one until it has the next
+    assert lazy.most <= 3  # a loop over a zip holds one until it has the next
     assert all(
         torch.equal(a, b.labels) and torch.equal(c, b.confidence) for (a, c), b in zip(found, expected, strict=True)
     )

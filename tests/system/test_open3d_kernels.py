@@ -1,4 +1,4 @@
-"""Open3D's kernels load without the rest of its package, which can be imported later all the same."""
+"""Open3D's kernels load without the rest of its package, which can still be imported later."""
 
 from __future__ import annotations
 

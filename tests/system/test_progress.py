@@ -1,4 +1,4 @@
-"""Bars: shown where something lasts, and not where it is over before one could read them."""
+"""Bars are shown where something lasts, not where it is over before one could read them."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ def test_a_config_runs_nothing(config, tmp_path, attack, hidden):
 
 
 def test_the_attacks_would_work_elsewhere(tmp_path):
-    """nerfstudio's loader runs the first of them: what is asked above says something."""
+    """nerfstudio's loader runs the first of them, so the test above proves something."""
     import yaml
 
     ran = tmp_path / "ran"
@@ -101,7 +101,7 @@ def test_classes_that_have_moved_since_are_found_under_their_former_names(config
 
 
 def test_paths_in_config_yml_are_words_that_people_edit(config, tmp_path):
-    """Also a long one, with a space; by nerfstudio's loader too."""
+    """A long path with a space is one too, and nerfstudio's loader reads it."""
     import yaml
 
     changed = load_run_config(config)
@@ -114,7 +114,7 @@ def test_paths_in_config_yml_are_words_that_people_edit(config, tmp_path):
 
 
 def test_a_saved_config_names_no_folder_but_those_that_were_given(tmp_path, monkeypatch):
-    """The data parser's folder, left at its default, would be the one that ns-train was called in."""
+    """The data parser's default folder would be the one that ns-train was called in."""
     from beags_plugin.plugin.presets import preset_config
 
     (tmp_path / "called_here").mkdir()
@@ -169,14 +169,14 @@ def test_checkpoints_run_nothing(tmp_path):
 
 
 def test_every_reader_of_tensors_refuses_code():
-    """No module loads pickles otherwise."""
+    """No other module loads pickles."""
     root = ROOT / "beags_plugin"
     allowed = {"system/reading/tensors.py"}
     for path in root.rglob("*.py"):
         text = path.read_text("utf8")
         name = path.relative_to(root).as_posix()
         assert name in allowed or not re.search(r"(?<!`)torch\.load\(", text), name
-        own = name == "masks/sources/two_stage.py"  # what it has written itself, to a temporary folder
+        own = name == "masks/sources/two_stage.py"  # it reads its own temporary files
         assert (own or "np.load(" not in text) and "allow_pickle=True" not in text and "pickle.load" not in text, name
         read = re.sub(r"yaml\.add_constructor\(.*\)", "", text)  # Nerfstudio itself reads these.
         assert "yaml.Loader" not in read and "yaml.full_load" not in read, name
@@ -200,7 +200,7 @@ def test_a_tensor_that_a_few_numbers_stand_for_is_refused(tmp_path):
 
 
 def test_a_checkpoint_of_something_else_is_refused(tmp_path):
-    """Found by fuzzing: a bare storage is no table, and says so in an error of its own."""
+    """Fuzzing found that a bare storage is no table and raises an error of its own."""
     from beags_plugin.importers.checkpoint import CheckpointImporter
 
     for content in (torch.zeros(3).storage(), [1, 2], {"pipeline": 3}, {"pipeline": {1: 2}}):
@@ -244,7 +244,7 @@ def test_objects_are_not_unpickled(tmp_path):
 
 
 def test_an_archive_whose_list_is_a_lie_is_refused(tmp_path):
-    """The list says that a member is longer than the file: 4 GB of a stored one."""
+    """The list says that a stored member has 4 GB, more than the file."""
     np.savez(tmp_path / "a.npz", a=np.zeros(3))
     content = (tmp_path / "a.npz").read_bytes()
     at = content.index(b"PK\x01\x02") + 24  # its size in the list
@@ -275,7 +275,7 @@ def test_bombs_of_pixels_are_refused(tmp_path):
 
 
 def test_only_formats_of_photos_are_opened(tmp_path):
-    """Others start programs, as PostScript's does."""
+    """Others start programs, as PostScript does."""
     Image.new("RGB", (4, 4)).save(tmp_path / "a.eps")
     (tmp_path / "a.eps").rename(tmp_path / "a.png")
     Image.open(tmp_path / "a.png").close()  # Pillow would take it

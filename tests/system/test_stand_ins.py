@@ -1,4 +1,4 @@
-"""Pointers, web pages and empty files in place of data: every reader says what they are and what to do."""
+"""Every reader recognises pointers, web pages and empty files in place of data, and says what to do."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ READERS = {
     "DTU": in_dtu,
     "classes.json": in_class_names,
 }
-NO_DATA = {("cameras.txt", "an empty file"), ("images.txt", "an empty file")}  # these hold no camera, and no image
+NO_DATA = {("cameras.txt", "an empty file"), ("images.txt", "an empty file")}  # an empty one holds no camera or image
 
 
 @pytest.mark.parametrize("kind", STAND_INS)
