@@ -4,28 +4,15 @@ from __future__ import annotations
 
 import pytest
 import torch
-from trained_scenes import FAR_APART, loss_inputs, trained_scene
+from trained_scenes import FAR_APART, loss_inputs, stepped, trained_scene
 
 from beags_baselines.gaussian_grouping import GaussianGroupingRefiner, IdentityTraining
 from beags_plugin.system.errors import UserError
 
 
-def stepped(training: IdentityTraining, steps: range, masked: bool = True) -> None:
-    """Make steps by the terms of identities alone."""
-    adam = torch.optim.Adam(list(vars(training.scene.surfels()).values()), lr=0.005)
-    for step in steps:
-        training.before_step(step)
-        adam.zero_grad()
-        terms = training.terms(loss_inputs(training.scene, step % 9, masked), step, dict)
-        if terms:
-            torch.stack(list(terms.values())).sum().backward()
-            adam.step()
-        training.after_step(step)
-
-
 def trained(steps: int = 0, **options) -> IdentityTraining:
     training = IdentityTraining(trained_scene(), GaussianGroupingRefiner(**options))
-    stepped(training, range(steps))
+    stepped(training, range(steps), geometry=True)
     return training
 
 
@@ -62,9 +49,9 @@ def test_neighbours_come_every_fifth_step_and_leave_the_geometry():
 def test_a_step_without_mask_and_neighbours_leaves_all_as_it_is():
     training = trained(3)
     before = [values.detach().clone() for values in training.learned.parameters]
-    stepped(training, range(6, 9), masked=False)
+    stepped(training, range(6, 9), masked=False, geometry=True)
     assert all(torch.equal(values, old) for values, old in zip(training.learned.parameters, before, strict=True))
-    stepped(training, range(10, 11), masked=False)
+    stepped(training, range(10, 11), masked=False, geometry=True)
     assert not any(torch.equal(values, old) for values, old in zip(training.learned.parameters, before, strict=True))
 
 

@@ -95,22 +95,20 @@ def test_gradients_of_neighbours_reach_codes_and_classifier():
 
 
 @pytest.mark.parametrize("num_classes", [5, 37])
-def test_losses_and_gradients_do_not_depend_on_the_number_of_threads(num_classes):
+def test_losses_and_gradients_do_not_depend_on_the_number_of_threads(num_classes, for_threads):
     groups = torch.randint(0, 60, (1_000, 6), generator=generator())  # each Gaussian in many places
     drawn = torch.rand(67, 90, 16, generator=generator())
     labels = torch.randint(0, num_classes, (67, 90), generator=generator())
-    threads, found = torch.get_num_threads(), []
-    try:
-        for count in (1, 2, 3, 3, 3, 4):
-            torch.set_num_threads(count)
-            classifier = identity_codes.initial_classifier(num_classes, generator())
-            leaves = [identity_codes.initial_codes(60, generator()), drawn]
-            codes, picture = (values.clone().requires_grad_() for values in leaves)
-            loss = neighbour_loss(classifier, codes, groups) + pixel_loss(classifier, picture, labels)
-            found.append([loss, *torch.autograd.grad(loss, [codes, picture, *classifier.parameters()])])
-    finally:
-        torch.set_num_threads(threads)
-    assert all(torch.equal(value, first) for each in found for value, first in zip(each, found[0], strict=True))
+
+    def run() -> list[torch.Tensor]:
+        classifier = identity_codes.initial_classifier(num_classes, generator())
+        leaves = [identity_codes.initial_codes(60, generator()), drawn]
+        codes, picture = (values.clone().requires_grad_() for values in leaves)
+        loss = neighbour_loss(classifier, codes, groups) + pixel_loss(classifier, picture, labels)
+        return [loss, *torch.autograd.grad(loss, [codes, picture, *classifier.parameters()])]
+
+    found = [*for_threads(run), *for_threads(run)]
+    assert all(torch.equal(first, each) for first, *rest in zip(*found, strict=True) for each in rest)
 
 
 def test_the_classifier_is_a_linear_layer():

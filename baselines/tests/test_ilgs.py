@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 from drawn_discs import camera, discs
-from trained_scenes import FAR_APART, loss_inputs, trained_scene
+from trained_scenes import FAR_APART, loss_inputs, stepped, trained_scene
 
 from beags_baselines import ilgs
 from beags_baselines.ilgs import IlgsRefiner, IlgsTraining, inside_hull, trusted_mean
@@ -90,17 +90,9 @@ def test_broken_centres_have_no_part_in_a_hull(broken):
     assert hull([[broken] * 3, *CORNERS[:3], [0.1, 0.1, 0.1]], 4) == [], "three are too few"
 
 
-def trained(steps: int = 0, masked: bool = True, **options) -> IlgsTraining:
+def trained(steps: int = 0, **options) -> IlgsTraining:
     training = IlgsTraining(trained_scene(steps=max(steps, 1_000)), IlgsRefiner(**options))
-    adam = torch.optim.Adam(list(vars(training.scene.surfels()).values()), lr=0.005)
-    for step in range(steps):
-        training.before_step(step)
-        adam.zero_grad()
-        terms = training.terms(loss_inputs(training.scene, step % 9, masked), step, dict)
-        if terms:
-            torch.stack(list(terms.values())).sum().backward()
-            adam.step()
-        training.after_step(step)
+    stepped(training, range(steps), geometry=True)
     return training
 
 

@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from trained_scenes import FAR_APART, trained_scene
+from trained_scenes import FAR_APART, crowded, stepped, trained_scene
 
 from beags_baselines import mask_tracking
 from beags_baselines import prototypes as parts
 from beags_baselines.instascene import ContrastTraining, InstaSceneRefiner
-from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.preparation.refiner_training import TrainedScene
 from beags_plugin.refiners import make_refiner
@@ -73,18 +72,9 @@ def test_orthonormal_prototypes():
         InstaSceneRefiner(gram_feat=True).check(names)
 
 
-def stepped(training: ContrastTraining, steps: range) -> None:
-    for step in steps:
-        training.before_step(step)
-        terms = training.terms(None, step, dict)  # pyright: ignore[reportArgumentType]
-        if terms:
-            torch.stack(list(terms.values())).sum().backward()
-        training.after_step(step)
-
-
 def trained(scene: TrainedScene, steps: int, **options) -> ContrastTraining:
     training = ContrastTraining(scene, InstaSceneRefiner(**{**FEW, **options}))
-    stepped(training, range(steps))
+    stepped(training, range(steps), drawn=False)
     return training
 
 
@@ -211,27 +201,20 @@ def test_a_restored_training_goes_on_bit_for_bit(options, step, tmp_path):
     torch.save(first.state(), tmp_path / "state.pt")
     second = trained(scene, 0, **options)
     second.restore(torch.load(tmp_path / "state.pt", weights_only=True))
-    stepped(second, range(step, 22))
+    stepped(second, range(step, 22), drawn=False)
     assert torch.equal(whole.features, second.features) and whole.tracked is not None
     assert second.tracked is not None and whole.tracked.suspect == second.tracked.suspect
     assert all(torch.equal(*pair) for pair in zip(whole.tracked.seeds, second.tracked.seeds, strict=True))
 
 
-def test_threads_change_nothing():
-    """Enough pixels and Gaussians for several threads to share."""
-    runs, before, base = [], torch.get_num_threads(), trained_scene()
-    surfels = base.surfels().detach()
-    many = Surfels(*(values.repeat(60, *[1] * (values.dim() - 1)) for values in vars(surfels).values()))
-    many.means[:] += 0.3 * torch.randn(many.means.shape, generator=torch.Generator().manual_seed(1))
-    scene = replace(base, surfels=lambda: many, class_ids=lambda: torch.zeros(len(many), dtype=torch.int32))
-    try:
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            training = trained(scene, 12, samples=32_768)
-            runs.append([training.features.detach(), training.seed_classes, training.finish().class_ids])
-    finally:
-        torch.set_num_threads(before)
-    assert all(torch.equal(*pair) for pair in zip(*runs, strict=True))
+def test_threads_change_nothing(for_threads):
+    scene = crowded(trained_scene())
+
+    def run() -> list[torch.Tensor]:
+        training = trained(scene, 12, samples=32_768)
+        return [training.features.detach(), training.seed_classes, training.finish().class_ids]
+
+    assert all(torch.equal(first, each) for first, *rest in zip(*for_threads(run), strict=True) for each in rest)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 from raster_scenes import facing
-from trained_scenes import FAR_APART, loss_inputs, trained_scene
+from trained_scenes import FAR_APART, crowded, loss_inputs, stepped, trained_scene
 
 from beags_baselines import instance_features as parts
 from beags_baselines.opengaussian import CodebookTraining, OpenGaussianRefiner
@@ -48,18 +48,9 @@ def solid_scene(steps: int) -> TrainedScene:
     return replace(scene, labels=[labels.where(alpha > 0.5, torch.zeros_like(labels)) for labels, alpha in pairs])
 
 
-def stepped(training: CodebookTraining, steps: range) -> None:
-    for step in steps:
-        training.before_step(step)
-        terms = training.terms(None, step, dict)  # pyright: ignore[reportArgumentType]
-        if terms:
-            torch.stack(list(terms.values())).sum().backward()
-        training.after_step(step)
-
-
 def trained(scene: TrainedScene, **options) -> CodebookTraining:
     training = CodebookTraining(scene, OpenGaussianRefiner(**options))
-    stepped(training, range(scene.steps))
+    stepped(training, range(scene.steps), drawn=False)
     return training
 
 
@@ -146,7 +137,7 @@ def test_a_cluster_that_hardly_shows_takes_no_step(monkeypatch):
     """Shrunk, or seen from afar, its largest alpha may be 0.8 or less."""
     scene = dots(64)
     training = CodebookTraining(scene, OpenGaussianRefiner(coarse=1, fine=2, **NO_LIMITS))
-    stepped(training, range(33))
+    stepped(training, range(33), drawn=False)
     training.book.occurs[:] = True
     draw, found = training.drawing.draw, []
     for factor in (0.79, 0.82):  # factors of alpha 0.99
@@ -172,7 +163,7 @@ def test_views_come_in_rounds_without_those_that_have_no_mask():
     rounds = [[training.view_of(3 * number + place) for place in range(3)] for number in range(9)]
     assert all(sorted(each) == [0, 1, 2] for each in rounds) and len({tuple(each) for each in rounds}) > 2
     nothing = CodebookTraining(dots(8, unlabelled=True), OpenGaussianRefiner())
-    stepped(nothing, range(8))
+    stepped(nothing, range(8), drawn=False)
     assert nothing.finish().present() == [0]
 
 
@@ -181,32 +172,24 @@ def test_a_restored_training_goes_on_bit_for_bit(step, tmp_path):
     scene, options = trained_scene(steps=32), {"coarse": 5, "fine": 3, **NO_LIMITS}
     whole = trained(scene, **options)
     first = CodebookTraining(scene, OpenGaussianRefiner(**options))
-    stepped(first, range(step))
+    stepped(first, range(step), drawn=False)
     torch.save(first.state(), tmp_path / "state.pt")
     second = CodebookTraining(scene, OpenGaussianRefiner(**options))
     second.restore(torch.load(tmp_path / "state.pt", weights_only=True))
-    stepped(second, range(step, 32))
+    stepped(second, range(step, 32), drawn=False)
     assert torch.equal(whole.features, second.features)
     for name, values in vars(whole.book).items():
         assert torch.equal(values, vars(second.book)[name]), name
 
 
-def test_threads_change_nothing():
-    """Enough pixels and Gaussians for several threads to share."""
-    runs, before = [], torch.get_num_threads()
-    base = trained_scene(steps=24)
-    surfels = base.surfels().detach()
-    many = Surfels(*(values.repeat(60, *[1] * (values.dim() - 1)) for values in vars(surfels).values()))
-    many.means[:] += 0.3 * torch.randn(many.means.shape, generator=torch.Generator().manual_seed(1))
-    scene = replace(base, surfels=lambda: many, class_ids=lambda: torch.zeros(len(many), dtype=torch.int32))
-    try:
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            training = trained(scene, coarse=6, fine=3, **NO_LIMITS)
-            runs.append([training.features.detach(), *vars(training.book).values(), training.finish().class_ids])
-    finally:
-        torch.set_num_threads(before)
-    assert all(torch.equal(*pair) for pair in zip(*runs, strict=True))
+def test_threads_change_nothing(for_threads):
+    scene = crowded(trained_scene(steps=24))
+
+    def run() -> list[torch.Tensor]:
+        training = trained(scene, coarse=6, fine=3, **NO_LIMITS)
+        return [training.features.detach(), *vars(training.book).values(), training.finish().class_ids]
+
+    assert all(torch.equal(first, each) for first, *rest in zip(*for_threads(run), strict=True) for each in rest)
 
 
 @pytest.mark.parametrize("rule", ["classes", "query"])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from drawn_discs import camera, discs
-from trained_scenes import FAR_APART, loss_inputs, trained_scene
+from trained_scenes import FAR_APART, loss_inputs, stepped, trained_scene
 
 from beags_baselines import object_codebook
 from beags_baselines.unified_lift import CodebookTraining, UnifiedLiftRefiner
@@ -21,16 +21,6 @@ from beags_plugin.system.errors import UserError
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     monkeypatch.setattr(object_codebook, "SAMPLES", 2_000)
-
-
-def stepped(training: CodebookTraining, steps: range, masked: bool = True) -> None:
-    views = len(training.scene.cameras)
-    for step in steps:
-        training.before_step(step)
-        terms = training.terms(loss_inputs(training.scene, step % views, masked), step, dict)
-        if terms:
-            torch.stack(list(terms.values())).sum().backward()
-        training.after_step(step)
 
 
 def trained(steps: int = 0, scene: TrainedScene | None = None, **options) -> CodebookTraining:

@@ -64,14 +64,15 @@ def gaussians_of(
 
     Raises ``ValueError`` for arrays of different lengths.
     """
+
+    def single(values: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+
     if len({len(each) for each in (means, quats, log_scales, alphas, dc, rest)}) > 1:
         raise ValueError("its Gaussians have not as many places as rotations, scales, opacities or colours")
     rest = rest[:, : num_sh_bases(MAX_DEGREE) - 1]
     logits = torch.logit(torch.from_numpy(np.ascontiguousarray(alphas, dtype=np.float64))).float()
-    tensors = [
-        torch.from_numpy(np.ascontiguousarray(each, dtype=np.float32)) for each in (means, quats, log_scales, dc, rest)
-    ]
-    return Gaussians(*tensors[:3], logits, *tensors[3:])
+    return Gaussians(single(means), single(quats), single(log_scales), logits, single(dc), single(rest))
 
 
 def with_largest(three: np.ndarray, place: np.ndarray) -> np.ndarray:

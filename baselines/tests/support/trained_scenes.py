@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import nullcontext
+from dataclasses import replace
 
 import torch
 from data_folders import CX, CY, FX, FY, HEIGHT, WIDTH, ring
@@ -12,7 +14,7 @@ from beags_plugin.core.cameras import Camera, viewmat_from_opengl
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.losses.base import LossInputs
-from beags_plugin.preparation.refiner_training import TrainedScene
+from beags_plugin.preparation.refiner_training import OwnTraining, TrainedScene
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import render_class_map, surfel_inputs
@@ -60,3 +62,28 @@ def loss_inputs(scene: TrainedScene, view: int = 0, masked: bool = True) -> Loss
     render = scene.rasterizer.rasterize(surfel_inputs(surfels, camera), camera, scene.settings, torch.zeros(3))
     labels = scene.labels[view] if masked else None
     return LossInputs(0, 0, surfels, camera, render, torch.zeros_like(render.color), labels, scene.class_ids())
+
+
+def stepped(own: OwnTraining, steps: Iterable[int], masked: bool = True, drawn: bool = True, geometry: bool = False):
+    """Make steps without the terms of the base.
+
+    masked: whether views have masks. drawn: whether the training gets a rendering, which some trainings do not read.
+    geometry: whether the Gaussians learn from its terms too.
+    """
+    scene = own.scene
+    adam = torch.optim.Adam(list(vars(scene.surfels()).values()) if geometry else [torch.zeros(())], lr=0.005)
+    for step in steps:
+        own.before_step(step)
+        adam.zero_grad()
+        inputs = loss_inputs(scene, step % len(scene.cameras), masked) if drawn else None
+        if terms := own.terms(inputs, step, dict):  # pyright: ignore[reportArgumentType]
+            torch.stack(list(terms.values())).sum().backward()
+            adam.step()
+        own.after_step(step)
+
+
+def crowded(scene: TrainedScene) -> TrainedScene:
+    """Return a scene with Gaussians enough for several threads to share."""
+    many = Surfels(*(each.repeat(60, *[1] * (each.dim() - 1)) for each in vars(scene.surfels().detach()).values()))
+    many.means[:] += 0.3 * torch.randn(many.means.shape, generator=torch.Generator().manual_seed(1))
+    return replace(scene, surfels=lambda: many, class_ids=lambda: torch.zeros(len(many), dtype=torch.int32))
