@@ -108,13 +108,13 @@ def probabilities(classifier: Classify, codes: Tensor) -> Tensor:
     return classifier(codes).log_softmax(dim=-1).exp()
 
 
-def neighbour_loss(classifier: Classify, codes: Tensor, groups: Tensor, weight: float = WEIGHT_3D) -> Tensor:
+def neighbour_loss(classifier: Classify, codes: Tensor, groups: Tensor) -> Tensor:
     """Return L_3d. codes: [N, C]. groups: [A, 1 + k] int64, a result of ``nearest_in_space``."""
     # Determinism: the gradient of codes[groups] depends on the number of threads.
     q = probabilities(classifier, embedding(groups, codes))
     logs = (q + 1e-10).log()
     divergence = (q[:, :1] * (logs[:, :1] - logs[:, 1:])).sum(dim=-1)
-    return weight / NORMALISER * ordered_mean(divergence)
+    return WEIGHT_3D / NORMALISER * ordered_mean(divergence)
 
 
 def right_pixels(logits: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:

@@ -256,11 +256,11 @@ def matched_mask(drawn: Tensor, silhouette: Tensor, masks: MaskedPixels, labels:
     return best if float(scores[best]) > MATCH_SCORE else None
 
 
-def inliers(points: Tensor, factor: float = 1.0) -> Tensor:
+def inliers(points: Tensor) -> Tensor:
     """Return [n] bool: points whose mean squared distance to the nearest K = floor(sqrt(n)) is not far above others'.
 
-    points: [n, 3]. The bound is the mean plus ``factor`` standard deviations of all these distances. A point is the
-    nearest to itself.
+    points: [n, 3]. The bound is the mean plus the standard deviation of all these distances. A point is the nearest to
+    itself.
     """
     from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
 
@@ -269,5 +269,5 @@ def inliers(points: Tensor, factor: float = 1.0) -> Tensor:
     cloud = _finite(points.detach().cpu().double()).numpy()
     ranks = list(range(1, int(len(cloud) ** 0.5) + 1))
     squares = cKDTree(cloud).query(cloud, k=ranks, workers=torch.get_num_threads())[0] ** 2
-    inside = squares.mean(axis=1) <= squares.mean() + factor * squares.std()
+    inside = squares.mean(axis=1) <= squares.mean() + squares.std()
     return torch.from_numpy(inside).to(points.device)

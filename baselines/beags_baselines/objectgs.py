@@ -1,8 +1,8 @@
 """ObjectGS as a refiner, on surfels: fixed classes, and a cross-entropy of their blend (``object_entropy``).
 
 The source trains anchors and their networks from scratch, with the classes of seed points. Here the Gaussians of a
-trained base get classes (``object_labels``) and are trained in the same number at the refinement's rates, since the
-rates of the base's start would destroy it. With ``joint`` a base grows with the classes of its seed points.
+trained base get classes and are trained in the same number. They have the refinement's rates, since the rates of the
+base's start would destroy it. With ``joint`` a base grows with the classes of its seed points.
 
 Without anchors these properties are lost: opacity, shape and colour from networks for each view, so that a leak may be
 hidden in some views; the bound on a Gaussian's distance from its anchor, which gives its class; networks that all
@@ -13,20 +13,28 @@ Other differences from the source: classes come from blending weights in all vie
 the source seed points vote, by default by their tracks; pixels with the source's id 0, "unlabelled", are IGNORE here,
 and the background is one more object; the term of sizes is of areas, there of volumes; the weight of the cross-entropy
 is the same for all data, there it is chosen by data set.
+
+The option ``labels`` chooses among three rules of classes. "e6" is the assignment of beags: phi_i = argmax_c W[i, c].
+"nonzero", for study, is the argmax over objects only, like the source's vote that drops the background; there one stray
+object vote of twenty makes an object. "majority" projects centres into all views, without a test of occlusion, and
+takes the most frequent id there.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from beags_baselines import object_entropy
-from beags_baselines.object_labels import LABELS, labels_by_majority, labels_by_weight
+from beags_plugin.assignment.sparse_sums import TorchSparseSums, largest_in_rows
+from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import pixels_under
 from beags_plugin.core.membership import Membership
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.preparation.refiner import AssignedScene, Refiner
@@ -34,6 +42,8 @@ from beags_plugin.preparation.refiner_training import OwnTraining, Terms, Traine
 from beags_plugin.rasterizers.optional import optional_products
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.system.errors import UserError, check_choice
+
+LABELS = ("e6", "majority", "nonzero")  # the first is the default
 
 
 @dataclass(frozen=True)
@@ -108,3 +118,33 @@ class LabelledTraining(OwnTraining):
 
     def finish(self) -> Membership:
         return Membership(self.scene.class_ids())
+
+
+def labels_by_weight(keys: Tensor, sums: Tensor, count: int, num_classes: int, nonzero: bool = False) -> Tensor:
+    """Return [count] int32: the class of most weight for each Gaussian; ties go to the lower id, 0 without weight.
+
+    keys: [M] int64, i * num_classes + c, ascending; sums: [M] float64 above 0, W[i, c] over all views.
+    nonzero: leave out the background if an object has any weight.
+    """
+    if nonzero:
+        objects = keys % num_classes != BACKGROUND
+        keys, sums = keys[objects], sums[objects]
+    return largest_in_rows(keys, sums, count, num_classes)[0].int()
+
+
+def labels_by_majority(
+    points: Tensor, cameras: Sequence[Camera], labels: Sequence[Tensor | None], num_classes: int
+) -> Tensor:
+    """Return [N] int32: the class under most projections of each point [N, 3]; ties go to the lower id, 0 without any.
+
+    labels: per camera [H, W] int class ids or IGNORE, which does not vote; or None.
+    """
+    votes = TorchSparseSums(points.device)
+    for camera, mask in zip(cameras, labels, strict=True):
+        if mask is None:
+            continue
+        seen, row, column = pixels_under(points, camera)
+        label = mask[row, column].long()
+        keys = (seen * num_classes + label)[label != IGNORE]
+        votes.add(keys, torch.ones_like(keys, dtype=torch.float64))
+    return labels_by_weight(*votes.found(), len(points), num_classes)

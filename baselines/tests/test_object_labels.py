@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from drawn_discs import camera, discs
 
-from beags_baselines.object_labels import labels_by_majority, labels_by_weight
+from beags_baselines.objectgs import labels_by_majority, labels_by_weight
 from beags_plugin.labels.class_ids import IGNORE
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -21,17 +21,16 @@ def shown_pixels(
     settings: RasterSettings,
     held_out: Sequence[Camera],
     training: Sequence[Camera],
-    progress: Callable[[int, int], None] | None = None,
 ) -> list[Tensor]:
     """Return [H, W] bool for each held-out view: the pixels whose surface is visible in some training view.
 
     The surface is the median depth of the scene; a pixel without one is not shown. settings: with geometry.
-    progress: receives (done, total) training views. Every view is rendered once; one training view is held at a time.
+    Every view is rendered once; one training view is held at a time.
     """
     depths = list(render_depths(surfels.detach(), held_out, rasterizer, settings, "median"))
     shown = [torch.zeros_like(depth, dtype=torch.bool) for depth in depths]
     maps = PixelMaps([*held_out, *training])
-    surfaces = render_depths(surfels.detach(), training, rasterizer, settings, "median", progress)
+    surfaces = render_depths(surfels.detach(), training, rasterizer, settings, "median")
     for index, surface in enumerate(surfaces, start=len(held_out)):
         height, width = surface.shape
         for depth, mask, A, b in zip(depths, shown, *maps.towards(index), strict=False):

@@ -57,8 +57,8 @@ class Picture:
             Image.fromarray(settled(page)).save(self.output, quality=85, optimize=True)
 
 
-def settled(page: Page, seconds: float = 15.0) -> np.ndarray:
-    """Return the page's picture once it has not changed for ``seconds``; coarse pictures come before fine ones."""
+def settled(page: Page) -> np.ndarray:
+    """Return the page's picture once it has not changed for 15 seconds; coarse pictures come before fine ones."""
     shown, since = _pixels(page), time.monotonic()
 
     def still() -> bool:
@@ -66,7 +66,7 @@ def settled(page: Page, seconds: float = 15.0) -> np.ndarray:
         now = _pixels(page)
         if not np.array_equal(now, shown):
             shown, since = now, time.monotonic()
-        return time.monotonic() - since > seconds
+        return time.monotonic() - since > 15.0
 
     page.wait(still, 300)
     return shown

@@ -45,9 +45,9 @@ def case(count: int, width: int, height: int) -> Size:
     return Size(count, width, height, max(LEAST_WIDTH, 17.0 * (50_000 / (640 * 480) * width * height / count) ** 0.5))
 
 
-def milliseconds(call: Callable[[], Any], repeats: int, warm: int = 3) -> float:
+def milliseconds(call: Callable[[], Any], repeats: int) -> float:
     """Return the median time of a call on the GPU."""
-    for _ in range(warm):
+    for _ in range(3):  # the first calls are slower
         call()
     times = []
     for _ in range(repeats):
@@ -70,11 +70,6 @@ def peak_mb(call: Callable[[], Any]) -> float:
     return (torch.cuda.max_memory_allocated() - before) / 2**20
 
 
-def make_cuda() -> CudaRasterizer:
-    """Return the backend that is measured."""
-    return CudaRasterizer()
-
-
 class Rendering:
     """Forward and backward of one backend on one scene, with gradients of all parameters and colours."""
 
@@ -83,7 +78,7 @@ class Rendering:
         values = {**vars(scene.surfels), "colors": scene.colors}
         self.leaves = {name: values[name].detach().clone().requires_grad_() for name in LEAVES}
         self.settings = replace(scene.settings, distortion=False)
-        self.rasterizer = make_cuda()
+        self.rasterizer = CudaRasterizer()
 
     def images(self) -> dict[str, Tensor]:
         """Return the images of both backends: colour, alpha, normal, expected and median depth."""

@@ -24,7 +24,7 @@ def test_rows_of_renderings_and_steps(monkeypatch, tmp_path, capsys):
     if (reason := EmulatedCudaRasterizer.unavailable()) or (reason := extension.status()[1]):
         pytest.skip(reason)
     monkeypatch.setattr(cuda, "DEVICE", "cpu")
-    monkeypatch.setattr(cuda, "make_cuda", EmulatedCudaRasterizer)
+    monkeypatch.setattr(cuda, "CudaRasterizer", EmulatedCudaRasterizer)
     monkeypatch.setattr(cuda, "milliseconds", lambda call, repeats: call() and None or 4.0)
     monkeypatch.setattr(cuda, "peak_mb", lambda call: call() and None or 2.0)
     monkeypatch.setattr(cuda, "copy_rate", lambda: 1000.0)
