@@ -39,9 +39,9 @@ def options() -> list[str]:
 
     config: Any = base_config()
     parser = config.pipeline.datamanager.dataparser
-    found = [*_own("", config), *_own("pipeline.datamanager.", config.pipeline.datamanager)]
-    found += [*_own("pipeline.model.", config.pipeline.model), *_own("beags-data ", parser)]
-    return sorted(name.replace("_", "-") for name in found)
+    names = [*_own("", config), *_own("pipeline.datamanager.", config.pipeline.datamanager)]
+    names += [*_own("pipeline.model.", config.pipeline.model), *_own("beags-data ", parser)]
+    return sorted(name.replace("_", "-") for name in names)
 
 
 def _own(prefix: str, config: Any) -> Iterator[str]:

@@ -84,8 +84,8 @@ def reference(extensions: Extensions) -> str:
     return "\n\n".join(lines) + "\n"
 
 
-def rewritten(text: str, document: Path, repository: str, shown: set[Path]) -> str:
-    """Return a document's text with links that work in the site; adds the files that it shows to ``shown``.
+def rewritten(text: str, document: Path, repository: str, pictures: set[Path]) -> str:
+    """Return a document's text with links that work in the site; adds the files that it shows to ``pictures``.
 
     document: its file, below ROOT. repository: the public address, or "". Broken links stay, so that the build of the
     site reports them.
@@ -103,7 +103,7 @@ def rewritten(text: str, document: Path, repository: str, shown: set[Path]) -> s
         if not file.is_relative_to(docs) or file.is_dir():
             return path
         if file.suffix != ".md":
-            shown.add(file)
+            pictures.add(file)
         return file.relative_to(docs).as_posix()
 
     def link(match: re.Match[str]) -> str:
@@ -149,16 +149,16 @@ def write_pages(folder: Path) -> None:
     repository = urls.get("Repository", "").rstrip("/")
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    shown: set[Path] = set()
+    pictures: set[Path] = set()
     pages = {f"{path.stem}.md": notebook(path, folder) for path in sorted((ROOT / "docs").glob("*.ipynb"))}
     for document in [*(ROOT / name for name in PLACES), *sorted((ROOT / "docs").glob("*.md"))]:
         place = PLACES.get(str(document.relative_to(ROOT)), document.name)
-        pages[place] = rewritten(document.read_text("utf8"), document, repository, shown)
+        pages[place] = rewritten(document.read_text("utf8"), document, repository, pictures)
     pages |= {each.page: reference(each) for package in PACKAGES for each in registries(package)}
     for place, text in pages.items():
         (folder / place).parent.mkdir(parents=True, exist_ok=True)
         (folder / place).write_text(text, "utf8")
-    for file in shown:
+    for file in pictures:
         copy = folder / file.relative_to(ROOT / "docs")
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, copy)

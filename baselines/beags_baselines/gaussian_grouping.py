@@ -61,8 +61,8 @@ class IdentityTraining(CodeTraining):
         terms, learned = base(), self.learned
         if inputs.labels is not None and bool((inputs.labels != IGNORE).any()):  # a view without a mask is all IGNORE
             labels = self.ranks.ranked_labels(inputs.labels)
-            drawn = learned.drawn(inputs.surfels, inputs.camera)
-            terms["identities"] = identity_codes.pixel_loss(learned.classifier, drawn, labels)
+            rendered = learned.rendered(inputs.surfels, inputs.camera)
+            terms["identities"] = identity_codes.pixel_loss(learned.classifier, rendered, labels)
         if step % identity_codes.INTERVAL == 0:
             groups = identity_codes.nearest_in_space(inputs.surfels.means, self.scene.generator(step, NEIGHBOURS))
             terms["neighbours"] = identity_codes.neighbour_loss(learned.classifier, learned.codes, groups)

@@ -71,9 +71,9 @@ def rate_factor(steps: int) -> float:
     return min(FULL_STEPS / steps, FASTEST)
 
 
-def pixel_loss(classifier: Classify, drawn: Tensor, labels: Tensor | None) -> Tensor:
-    """Return L_2d; 0 without labelled pixels. drawn: [H, W, C], E. labels: [H, W] int or IGNORE; None without mask."""
-    return label_entropy(classifier(drawn), labels) / math.log(NORMALISER)
+def pixel_loss(classifier: Classify, rendered: Tensor, labels: Tensor | None) -> Tensor:
+    """Return L_2d; 0 without labelled pixels. rendered: [H, W, C], E. labels: [H, W] int or IGNORE; None: no mask."""
+    return label_entropy(classifier(rendered), labels) / math.log(NORMALISER)
 
 
 def nearest_in_space(

@@ -87,8 +87,8 @@ class IlgsTraining(CodeTraining):
         labelled = labels != IGNORE
         if not bool(labelled.any()):  # a view without a mask
             return terms
-        drawn = self.learned.drawn(inputs.surfels, inputs.camera).flatten(0, 1)
-        entropies = code_entropy(self.learned.classifier, drawn, labels, self.outputs)
+        rendered = self.learned.rendered(inputs.surfels, inputs.camera).flatten(0, 1)
+        entropies = code_entropy(self.learned.classifier, rendered, labels, self.outputs)
         share = (step + 1) / self.scene.steps
         return {**terms, "identities": self.options.weight * trusted_mean(entropies, labelled, share)}
 

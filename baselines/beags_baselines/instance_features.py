@@ -88,10 +88,10 @@ class MaskedPixels:
         return self.sums(rows * weights) / self.sums(weights).clamp_min(1.0)
 
 
-def cohesion(drawn: Tensor, means: Tensor, masks: MaskedPixels) -> Tensor:
+def cohesion(rendered: Tensor, means: Tensor, masks: MaskedPixels) -> Tensor:
     """Return the mean over masks of the mean distance of their pixels [P, 6] from the mask's mean [n, 6]."""
-    distances = _length(drawn - masks.spread(means))[:, 0]
-    shares = pad(1.0 / masks.areas.to(drawn.dtype), (0, 1))[masks.places]
+    distances = _length(rendered - masks.spread(means))[:, 0]
+    shares = pad(1.0 / masks.areas.to(rendered.dtype), (0, 1))[masks.places]
     return ordered_sum(distances * shares) / max(len(masks), 1)
 
 
@@ -132,10 +132,10 @@ class PseudoMasks:
         return cls(nothing, nothing, like.new_zeros(0, CHANNELS), nothing.bool())
 
     @classmethod
-    def of_view(cls, view: int, drawn: Tensor, masks: MaskedPixels) -> PseudoMasks:
-        """Return the masks of one view; drawn: [P, 6], F."""
-        means = masks.means(drawn)
-        variance = masks.means((drawn - masks.spread(means)).square()).mean(dim=1)
+    def of_view(cls, view: int, rendered: Tensor, masks: MaskedPixels) -> PseudoMasks:
+        """Return the masks of one view; rendered: [P, 6], F."""
+        means = masks.means(rendered)
+        variance = masks.means((rendered - masks.spread(means)).square()).mean(dim=1)
         large = masks.areas > LARGE_AREA * masks.areas.max() if len(masks) else masks.areas > 0
         return cls(torch.full_like(masks.classes, view), masks.classes, means, (variance <= MAX_VARIANCE) | large)
 
@@ -151,7 +151,7 @@ class PseudoMasks:
 
 
 def label_loss(
-    drawn: Tensor,
+    rendered: Tensor,
     alpha: Tensor,
     masks: MaskedPixels,
     labels: PseudoMasks,
@@ -160,10 +160,10 @@ def label_loss(
 ) -> Tensor:
     """Return the mean of |F - G|_1 over labelled solid pixels; G is the mean of the pixel's mask, or 0 if not kept.
 
-    drawn: [P, 6]. alpha: [P]. squared: |F - G|^2 instead. exclude_dropped: pixels of masks that are not kept do not
+    rendered: [P, 6]. alpha: [P]. squared: |F - G|^2 instead. exclude_dropped: pixels of masks that are not kept do not
     count.
     """
-    difference = drawn - masks.spread(labels.means * labels.kept[:, None])
+    difference = rendered - masks.spread(labels.means * labels.kept[:, None])
     distances = (difference.square() if squared else difference.abs()).sum(dim=1)
     counted = (alpha > SOLID) & masks.labelled
     if exclude_dropped:
@@ -226,22 +226,24 @@ def first_centres(vectors: Tensor, count: int, generator: torch.Generator) -> Te
     return pad(_finite(vectors[chosen]), (0, 0, 0, count - len(chosen)))
 
 
-def fine_clusters(drawn: Tensor, silhouette: Tensor, masks: MaskedPixels, labels: PseudoMasks, most: int = 10) -> int:
+def fine_clusters(
+    rendered: Tensor, silhouette: Tensor, masks: MaskedPixels, labels: PseudoMasks, most: int = 10
+) -> int:
     """Return the number of a view's pseudo masks that a cluster, rendered alone, shows: see ``opengaussian``.
 
-    drawn: [P, 6]. silhouette: [P] bool. A mask counts if the silhouette covers more than a fifth of it and both have
+    rendered: [P, 6]. silhouette: [P] bool. A mask counts if the silhouette covers more than a fifth of it and both have
     similar means over the common pixels.
     """
-    covered = masks.sums(silhouette.to(drawn.dtype)[:, None])[:, 0] / masks.areas
-    difference = masks.means(drawn, silhouette) - labels.means
+    covered = masks.sums(silhouette.to(rendered.dtype)[:, None])[:, 0] / masks.areas
+    difference = masks.means(rendered, silhouette) - labels.means
     alike = (difference.abs().sum(dim=1) < 0.9) & (difference.square().sum(dim=1) < 0.25)
     return min(int((labels.kept & (covered > 0.2) & alike).sum()), most)
 
 
-def matched_mask(drawn: Tensor, silhouette: Tensor, masks: MaskedPixels, labels: PseudoMasks) -> int | None:
+def matched_mask(rendered: Tensor, silhouette: Tensor, masks: MaskedPixels, labels: PseudoMasks) -> int | None:
     """Return the index of the pseudo mask that best matches a leaf rendered alone, or None.
 
-    The score is IoU x (1 - |mean F over the silhouette - mean of the mask|_1), over labelled pixels. drawn: [P, 6].
+    The score is IoU x (1 - |mean F over the silhouette - mean of the mask|_1), over labelled pixels. rendered: [P, 6].
     silhouette: [P] bool.
     """
     silhouette = silhouette & masks.labelled
@@ -249,7 +251,7 @@ def matched_mask(drawn: Tensor, silhouette: Tensor, masks: MaskedPixels, labels:
     if not len(masks) or area == 0:
         return None
     common = masks.sums(silhouette.to(torch.float64)[:, None])[:, 0]
-    mean = grouped_sums(drawn, (~silhouette).long(), 2)[0] / area
+    mean = grouped_sums(rendered, (~silhouette).long(), 2)[0] / area
     likeness = 1.0 - (mean - labels.means).abs().sum(dim=1).double()
     scores = (common / (area + masks.areas - common) * likeness).masked_fill(~labels.kept, 0.0)
     best = int(scores.argmax())

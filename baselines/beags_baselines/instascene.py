@@ -107,12 +107,12 @@ class ContrastTraining(FeatureTraining):
         if not self.masked or self.tracked is None:
             return {}
         units, view = prototypes.unit(self.features), self.view_of(step)
-        drawn, ranks = self.drawing.channels(view, units), self.ranks_of(view).flatten()
+        rendered, ranks = self.drawing.channels(view, units), self.ranks_of(view).flatten()
         filtered = self.tracked.filtered(view, ranks)
         least = 0 if self.options.consider_negative else 1
-        terms = {"single": SINGLE * self._of_pixels([drawn], [filtered], least, step, PIXELS)}
+        terms = {"single": SINGLE * self._of_pixels([rendered], [filtered], least, step, PIXELS)}
         if self.fixed is not None:
-            terms["unfiltered"] = UNFILTERED * self._of_pixels([drawn], [ranks], least, step, ALL_PIXELS)
+            terms["unfiltered"] = UNFILTERED * self._of_pixels([rendered], [ranks], least, step, ALL_PIXELS)
         if step % INTERVAL == 0:
             several = self._several(step)
             images = [self.drawing.channels(each, units) for each in several]
@@ -142,8 +142,10 @@ class ContrastTraining(FeatureTraining):
 
     def state(self) -> dict[str, Any]:
         tracked = self.tracked
-        found = {} if tracked is None else {"seeds": list(tracked.seeds), "suspect": sorted(map(list, tracked.suspect))}
-        return {"features": self.features.detach(), "adam": self.adam.state_dict(), **found}
+        state = {"features": self.features.detach(), "adam": self.adam.state_dict()}
+        if tracked is not None:
+            state |= {"seeds": list(tracked.seeds), "suspect": sorted(map(list, tracked.suspect))}
+        return state
 
     def restore(self, state: dict[str, Any]) -> None:
         with torch.no_grad():

@@ -31,8 +31,8 @@ class FrozenDrawing:
 
         own: [M] int64, the Gaussians to render alone; None for all. size: factor of their sizes.
         """
-        drawn = self.channels(view, torch.cat([features, torch.ones_like(features[:, :1])], dim=1), own, size)
-        return drawn[:, :-1], drawn[:, -1].detach()
+        rendered = self.channels(view, torch.cat([features, torch.ones_like(features[:, :1])], dim=1), own, size)
+        return rendered[:, :-1], rendered[:, -1].detach()
 
     def channels(self, view: int, features: Tensor, own: Tensor | None = None, size: float = 1.0) -> Tensor:
         """Return only the first result of ``draw``."""

@@ -44,7 +44,7 @@ class LearnedCodes:
             ]
         )
 
-    def drawn(self, surfels: Surfels, camera: Camera) -> Tensor:
+    def rendered(self, surfels: Surfels, camera: Camera) -> Tensor:
         """Render the codes in a view, [H, W, 16]; surfels that require gradients get them."""
         inputs = surfel_inputs(surfels, camera, sh_degree=0)  # the codes replace the colours
         return draw_features(self.scene.rasterizer, inputs, self.codes, camera, self.scene.settings)
@@ -62,7 +62,7 @@ class LearnedCodes:
         with torch.no_grad(), scene.stage("Checking identities") as progress:
             for index, camera in enumerate(scene.cameras):
                 if (labels := scene.labels[index]) is not None:
-                    logits = self.classifier(self.drawn(surfels, camera))
+                    logits = self.classifier(self.rendered(surfels, camera))
                     labels = ranks.ranked_labels(labels.to(logits.device))
                     counts += torch.stack(identity_codes.right_pixels(logits, labels)).cpu()
                 progress(index + 1, len(scene.cameras))

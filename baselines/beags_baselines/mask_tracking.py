@@ -101,8 +101,8 @@ def tracked_masks(
     background counts as an object, as the ground does in the source's masks.
     """
     masks, sets = _masks(views, min_gaussians)
-    split, shown = _splits(views, sets, count, ground_votes, progress)
-    under = (shown == 0) | (split > SPLIT * shown)
+    split, visible = _splits(views, sets, count, ground_votes, progress)
+    under = (visible == 0) | (split > SPLIT * visible)
     accepted = [mask for mask, bad in zip(masks, under.tolist(), strict=True) if not bad]
     seeds = _seeds(views, accepted, count, num_classes)
     suspect = under.nonzero()[:, 0].tolist()
@@ -120,9 +120,9 @@ def tracked_masks(
 def _masks(views: list[TracedView], min_gaussians: int) -> tuple[list[tuple[int, int]], list[Tensor]]:
     """Return (view, rank) of the tracked masks of objects, and the Gaussians Q of each."""
     masks, sets = [], []
-    for view, found in enumerate(views):
-        for rank in torch.unique(found.classes).tolist():
-            own = found.members[found.classes == rank]
+    for view, trace in enumerate(views):
+        for rank in torch.unique(trace.classes).tolist():
+            own = trace.members[trace.classes == rank]
             if rank > 0 and len(own) >= min_gaussians:
                 masks.append((view, rank))
                 sets.append(own)
@@ -139,20 +139,20 @@ def _splits(
     sizes = torch.tensor([len(each) for each in sets], device=device)
     members = torch.cat(sets)
     owners = torch.arange(len(sets), device=device, dtype=torch.int32).repeat_interleave(sizes)
-    split, shown = torch.zeros_like(sizes), torch.zeros_like(sizes)
+    split, visible = torch.zeros_like(sizes), torch.zeros_like(sizes)
     for done, view in enumerate(views, start=1):
-        found = view.strongest(count, ground)[members.long()]
-        known = found > 0
-        width = int(found.max()) + 1
-        pairs, counts = torch.unique(owners[known].long() * width + found[known], return_counts=True)
+        classes = view.strongest(count, ground)[members.long()]
+        labelled = classes > 0
+        width = int(classes.max()) + 1
+        pairs, counts = torch.unique(owners[labelled].long() * width + classes[labelled], return_counts=True)
         largest = torch.zeros_like(sizes).scatter_reduce(0, pairs // width, counts, "amax")
-        total = torch.bincount(owners[known].long(), minlength=len(sets))
-        visible = (sizes - total) <= HIDDEN * sizes
-        shown += visible
-        split += visible & ~(largest > CONTAINED * total)
+        total = torch.bincount(owners[labelled].long(), minlength=len(sets))
+        not_hidden = (sizes - total) <= HIDDEN * sizes
+        visible += not_hidden
+        split += not_hidden & ~(largest > CONTAINED * total)
         if progress:
             progress(done, len(views))
-    return split, shown
+    return split, visible
 
 
 def _seeds(
@@ -168,8 +168,8 @@ def _seeds(
         to_class = torch.zeros(count, dtype=torch.int32, device=device)
         anywhere = torch.zeros_like(to_class)
         for view in those if len(those) >= LEAST_VIEWS else []:
-            found = views[view]
-            to_class[found.members[found.classes == rank].long()] += 1
-            anywhere[found.traced.long()] += 1
+            trace = views[view]
+            to_class[trace.members[trace.classes == rank].long()] += 1
+            anywhere[trace.traced.long()] += 1
         seeds.append((to_class / (anywhere + 1e-6) > SEEDED).nonzero()[:, 0])
     return tuple(seeds)

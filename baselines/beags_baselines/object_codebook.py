@@ -47,21 +47,21 @@ def sampled(count: int, generator: torch.Generator) -> Tensor:
     return torch.randint(count, (SAMPLES,), generator=generator)
 
 
-def directions(drawn: Tensor) -> Tensor:
+def directions(rendered: Tensor) -> Tensor:
     """Return x [P, C] of F [P, C]; the norm has no gradient."""
-    return drawn / (drawn.detach().norm(dim=1, keepdim=True) + 1e-6)
+    return rendered / (rendered.detach().norm(dim=1, keepdim=True) + 1e-6)
 
 
-def contrast(drawn: Tensor, ids: Tensor) -> Tensor:
+def contrast(rendered: Tensor, ids: Tensor) -> Tensor:
     """Return L_con of sampled pixels; 0, with a gradient of 0, if no id has enough of them.
 
-    drawn: [S, C], F. ids: [S] int64, of any values.
+    rendered: [S, C], F. ids: [S] int64, of any values.
     """
-    x = directions(drawn)
+    x = directions(rendered)
     _, group, counts = torch.unique(ids, return_inverse=True, return_counts=True)
     enough = counts > LEAST_PIXELS
     if (many := int(enough.sum())) == 0:
-        return 0.0 * ordered_sum(drawn)
+        return 0.0 * ordered_sum(rendered)
     group = torch.where(enough, enough.cumsum(0) - 1, many)[group]  # the other ids form a last group, which is dropped
     means, temperatures = _prototypes(x, group, many + 1, 10.0, 0.5)
     means, temperatures = means[:many], temperatures[:many]
@@ -71,20 +71,20 @@ def contrast(drawn: Tensor, ids: Tensor) -> Tensor:
     return ordered_sum(torch.where(group < many, each, 0.0)) / many
 
 
-def norms(drawn: Tensor, labelled: Tensor) -> Tensor:
-    """Return L_reg over the labelled pixels, at least one. drawn: [P, C]. labelled: [P] bool."""
-    return ordered_sum(torch.where(labelled, (drawn.norm(dim=1) - 1.0) ** 2, 0.0)) / labelled.sum()
+def norms(rendered: Tensor, labelled: Tensor) -> Tensor:
+    """Return L_reg over the labelled pixels, at least one. rendered: [P, C]. labelled: [P] bool."""
+    return ordered_sum(torch.where(labelled, (rendered.norm(dim=1) - 1.0) ** 2, 0.0)) / labelled.sum()
 
 
 @torch.no_grad()
-def reliable(drawn: Tensor, group: Tensor, count: int) -> Tensor:
-    """Return R, [P] bool. drawn: [P, C], F. group: [P] int64 below ``count``, the numbered ids of the view."""
-    return own_shares(drawn, group, count) > RELIABLE
+def reliable(rendered: Tensor, group: Tensor, count: int) -> Tensor:
+    """Return R, [P] bool. rendered: [P, C], F. group: [P] int64 below ``count``, the numbered ids of the view."""
+    return own_shares(rendered, group, count) > RELIABLE
 
 
-def own_shares(drawn: Tensor, group: Tensor, count: int) -> Tensor:
+def own_shares(rendered: Tensor, group: Tensor, count: int) -> Tensor:
     """Return p [P], the share of each pixel's own id among the prototypes; see ``reliable``."""
-    x = directions(drawn)
+    x = directions(rendered)
     means, temperatures = _prototypes(x, group, count, 0.1, 0.1)
     weight, nothing = means / temperatures[:, None], x.new_zeros(count)
     shares = torch.empty_like(x[:, 0])
@@ -106,16 +106,16 @@ def _prototypes(x: Tensor, group: Tensor, count: int, factor: float, least: floa
 
 
 @torch.no_grad()
-def code_masses(classify: Classify, drawn: Tensor, group: Tensor, count: int, codes: int) -> tuple[Tensor, Tensor]:
+def code_masses(classify: Classify, rendered: Tensor, group: Tensor, count: int, codes: int) -> tuple[Tensor, Tensor]:
     """Return the sums of softmax(B F) over each id's pixels, [count, codes], and the largest code of each pixel, [P].
 
-    drawn: [P, C], F. group: [P] int64 below ``count``.
+    rendered: [P, C], F. group: [P] int64 below ``count``.
     """
-    masses, largest = drawn.new_zeros(count, codes), torch.empty_like(group)
-    for rows in _chunks(len(drawn), codes + count):
-        logits = classify(drawn[rows])
+    masses, largest = rendered.new_zeros(count, codes), torch.empty_like(group)
+    for rows in _chunks(len(rendered), codes + count):
+        logits = classify(rendered[rows])
         largest[rows] = logits.argmax(dim=1)
-        one_hot = torch.nn.functional.one_hot(group[rows], count).to(drawn)
+        one_hot = torch.nn.functional.one_hot(group[rows], count).to(rendered)
         masses += ordered_outer_sum(one_hot, logits.softmax(dim=1))
     return masses, largest
 
@@ -132,30 +132,30 @@ def matching(masses: Tensor) -> Tensor:
     return torch.from_numpy(linear_sum_assignment(masses.double().cpu().numpy(), maximize=True)[1]).to(masses.device)
 
 
-def code_entropy(classify: Classify, drawn: Tensor, labels: Tensor, outputs: int) -> Tensor:
+def code_entropy(classify: Classify, rendered: Tensor, labels: Tensor, outputs: int) -> Tensor:
     """Return the cross-entropy of each pixel, [P]; memory holds the logits of some pixels at a time, see ``AT_ONCE``.
 
-    drawn: [P, C]; it and the classifier get gradients. labels: [P] int below ``outputs``, or IGNORE, where the result
-    is 0.
+    rendered: [P, C]; it and the classifier get gradients. labels: [P] int below ``outputs``, or IGNORE, where the
+    result is 0.
     """
 
     def part(rows: slice) -> Tensor:
-        return cross_entropy(classify(drawn[rows]), labels[rows].long(), ignore_index=IGNORE, reduction="none")
+        return cross_entropy(classify(rendered[rows]), labels[rows].long(), ignore_index=IGNORE, reduction="none")
 
-    parts = _chunks(len(drawn), outputs)
+    parts = _chunks(len(rendered), outputs)
     if len(parts) == 1:
         return part(parts[0])
     return torch.cat([checkpoint(part, rows, use_reentrant=False, preserve_rng_state=False) for rows in parts])
 
 
-def selection(classify: Classify, drawn: Tensor, targets: Tensor, outputs: int) -> Tensor:
-    """Return L_cls of the pixels of R, at least one. drawn: [R, C], F. targets: [R] int64, pi(M)."""
-    return ordered_mean(code_entropy(classify, drawn, targets, outputs)) / math.log(NORMALISER)
+def selection(classify: Classify, rendered: Tensor, targets: Tensor, outputs: int) -> Tensor:
+    """Return L_cls of the pixels of R, at least one. rendered: [R, C], F. targets: [R] int64, pi(M)."""
+    return ordered_mean(code_entropy(classify, rendered, targets, outputs)) / math.log(NORMALISER)
 
 
-def concentration(codebook: Tensor, drawn: Tensor, targets: Tensor) -> Tensor:
-    """Return L_conc of the pixels of R; 0 without any. drawn: [R, C], F without gradient. targets: [R], pi(M)."""
-    return ordered_mean((directions(drawn) - embedding(targets, codebook)).norm(dim=1))
+def concentration(codebook: Tensor, rendered: Tensor, targets: Tensor) -> Tensor:
+    """Return L_conc of the pixels of R; 0 without any. rendered: [R, C], F without gradient. targets: [R], pi(M)."""
+    return ordered_mean((directions(rendered) - embedding(targets, codebook)).norm(dim=1))
 
 
 def owners(tables: Tensor) -> Tensor:

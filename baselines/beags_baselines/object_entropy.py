@@ -48,10 +48,10 @@ def label_entropy(logits: Tensor, labels: Tensor | None) -> Tensor:
     return ordered_sum(each) / (flat != IGNORE).sum().clamp(min=1)
 
 
-def mean_area(log_scales: Tensor, drawn: Tensor) -> Tensor:
-    """Return the mean product of both scales of the drawn Gaussians; 0 if there are none.
+def mean_area(log_scales: Tensor, visible: Tensor) -> Tensor:
+    """Return the mean product of both scales of the visible Gaussians; 0 if there are none.
 
-    log_scales: [N, 2]; the value is in squared units of the run's frame. drawn: [N] bool.
+    log_scales: [N, 2]; the value is in squared units of the run's frame. visible: [N] bool.
     """
-    areas = torch.where(drawn, log_scales.sum(dim=-1), -torch.inf).exp()
-    return ordered_sum(areas) / drawn.sum().clamp(min=1)
+    areas = torch.where(visible, log_scales.sum(dim=-1), -torch.inf).exp()
+    return ordered_sum(areas) / visible.sum().clamp(min=1)

@@ -147,16 +147,16 @@ class CodebookTraining(FeatureTraining):
             centres = book.fine.flatten(0, 1)[book.leaves[own]]
         features = self.features if own is None else embedding(own, self.features)
         quantised = parts.drawn_form(parts.straight_through(features, centres))
-        drawn, alpha = self.drawing.draw(view, quantised, own, size)
+        rendered, alpha = self.drawing.draw(view, quantised, own, size)
         if own is not None and not bool((alpha > SHOWS).any()):
             return {}
-        loss = parts.label_loss(drawn, alpha, masks, labels, own is not None, options.exclude_dropped)
+        loss = parts.label_loss(rendered, alpha, masks, labels, own is not None, options.exclude_dropped)
         return {"clusters" if own is None else "leaves": loss}
 
     def _first_terms(self, view: int, masks: parts.MaskedPixels, late: bool) -> Terms:
-        drawn, alpha = self.drawing.draw(view, parts.drawn_form(self.features))
-        means = masks.means(drawn, alpha > parts.SOLID)
-        close = parts.cohesion(drawn, means, masks)
+        rendered, alpha = self.drawing.draw(view, parts.drawn_form(self.features))
+        means = masks.means(rendered, alpha > parts.SOLID)
+        close = parts.cohesion(rendered, means, masks)
         return {"cohesion": self.options.cohesion_weight * close, "separation": parts.separation(means, late)}
 
     def _size(self, step: int) -> float:
@@ -179,13 +179,13 @@ class CodebookTraining(FeatureTraining):
 
     @torch.no_grad()
     def _take_pseudo_masks(self) -> None:
-        found, form = [], parts.drawn_form(self.features)
+        masks, features = [], parts.drawn_form(self.features)
         with self.scene.stage("Averaging features") as progress:
             for done, view in enumerate(self.masked, start=1):
-                drawn, _ = self.drawing.draw(view, form)
-                found.append(parts.PseudoMasks.of_view(view, drawn, self._masks(view)))
+                rendered, _ = self.drawing.draw(view, features)
+                masks.append(parts.PseudoMasks.of_view(view, rendered, self._masks(view)))
                 progress(done, len(self.masked))
-        self.masks = parts.PseudoMasks.joined(found) if found else self.masks
+        self.masks = parts.PseudoMasks.joined(masks) if masks else self.masks
 
     @torch.no_grad()
     def _begin_leaves(self, generator: torch.Generator) -> None:
@@ -194,7 +194,7 @@ class CodebookTraining(FeatureTraining):
         book, options, drawing = self.book, self.options, self.drawing
         largest = drawing.inputs.log_scales.max(dim=1).values
         small = largest < log(options.max_scale * self.scene.scale)
-        shown, seen = parts.drawn_form(self.features), torch.zeros_like(book.used)
+        features, seen = parts.drawn_form(self.features), torch.zeros_like(book.used)
         with self.scene.stage("Counting leaves") as progress:
             for done, view in enumerate(self.masked, start=1):
                 usable = small & drawing.visible(view)
@@ -202,15 +202,15 @@ class CodebookTraining(FeatureTraining):
                 counts = torch.bincount(book.clusters[usable], minlength=options.coarse)
                 for cluster in (counts >= options.min_gaussians).nonzero()[:, 0].tolist():
                     own = (usable & (book.clusters == cluster)).nonzero()[:, 0]
-                    drawn, alpha = drawing.draw(view, shown[own], own)
+                    rendered, alpha = drawing.draw(view, features[own], own)
                     if bool((alpha > SHOWS).any()):
-                        found = parts.fine_clusters(drawn, alpha > CLUSTER_SILHOUETTE, masks, labels)
-                        book.occurs[view, cluster] = found > 0
-                        seen[cluster] = max(int(seen[cluster]), found)
+                        leaves = parts.fine_clusters(rendered, alpha > CLUSTER_SILHOUETTE, masks, labels)
+                        book.occurs[view, cluster] = leaves > 0
+                        seen[cluster] = max(int(seen[cluster]), leaves)
                 progress(done, len(self.masked))
         book.used = (seen.clamp_min(1) + 1).clamp_max(options.fine)
         chosen = torch.randint(len(drawing), (options.coarse * options.fine,), generator=generator)
-        book.fine = self.features.detach()[chosen.to(shown.device)].view(options.coarse, options.fine, -1)
+        book.fine = self.features.detach()[chosen.to(features.device)].view(options.coarse, options.fine, -1)
 
     def _update_leaves(self, cluster: int) -> None:
         book, used = self.book, int(self.book.used[cluster])
@@ -222,9 +222,10 @@ class CodebookTraining(FeatureTraining):
     @torch.no_grad()
     def finish(self) -> Membership:
         options, leaves, votes = self.options, self.book.leaves, self._votes()
-        shown = torch.zeros_like(self.scene.class_ids())
+        class_ids = torch.zeros_like(self.scene.class_ids())
         if options.rule == "classes":
-            table = shown.new_zeros(options.coarse * options.fine + 1)  # the last entry stands for Gaussians in no leaf
+            # The last entry stands for Gaussians in no leaf.
+            table = class_ids.new_zeros(options.coarse * options.fine + 1)
             named = leaf_labels.classes_of_leaves(votes, options.min_views)
             for leaf, rank in named.items():
                 table[leaf] = self.ranks.ids[rank]
@@ -238,12 +239,12 @@ class CodebookTraining(FeatureTraining):
                 wanted = leaf_labels.queried_leaves(votes, rank, centres, options.fine)
                 chosen = torch.isin(leaves, leaves.new_tensor(wanted))
                 masks[class_id] = leaf_labels.queried_object(surfels, chosen, self.scene.scale, options.min_gaussians)
-        return Membership.of_masks(masks, shown)
+        return Membership.of_masks(masks, class_ids)
 
     def _votes(self) -> leaf_labels.Votes:
         """Render every leaf alone in every view that shows its cluster; return the classes of matching masks."""
         book, drawing, options = self.book, self.drawing, self.options
-        shown, votes = parts.drawn_form(self.features), {}
+        features, votes = parts.drawn_form(self.features), {}
         with self.scene.stage("Matching leaves") as progress:
             for done, view in enumerate(self.masked, start=1):
                 visible, masks, labels = drawing.visible(view), self._masks(view), self.masks.of(view)
@@ -251,8 +252,8 @@ class CodebookTraining(FeatureTraining):
                 occurs = book.occurs[view].repeat_interleave(options.fine)
                 for leaf in ((counts >= options.min_leaf) & occurs).nonzero()[:, 0].tolist():
                     own = (book.leaves == leaf).nonzero()[:, 0]
-                    drawn, alpha = drawing.draw(view, shown[own], own)
-                    place = parts.matched_mask(drawn, alpha > LEAF_SILHOUETTE, masks, labels)
+                    rendered, alpha = drawing.draw(view, features[own], own)
+                    place = parts.matched_mask(rendered, alpha > LEAF_SILHOUETTE, masks, labels)
                     if place is not None:
                         votes.setdefault(leaf, Counter())[int(masks.classes[place])] += 1
                 progress(done, len(self.masked))

@@ -70,34 +70,34 @@ class CodebookTraining(CodeTraining):
         labelled = labels != IGNORE
         if not bool(labelled.any()):  # a view without a mask
             return {}
-        drawn = self.learned.drawn(inputs.surfels.detach(), inputs.camera).flatten(0, 1)
+        rendered = self.learned.rendered(inputs.surfels.detach(), inputs.camera).flatten(0, 1)
         places = labelled.nonzero()[:, 0]
-        code_terms = self._terms_of_codes(drawn, labels, places, self.scene.generator(step, SAMPLES))
-        terms = {**code_terms, **self._terms_of_codebook(drawn.detach()[places], labels[places].long())}
+        code_terms = self._terms_of_codes(rendered, labels, places, self.scene.generator(step, SAMPLES))
+        terms = {**code_terms, **self._terms_of_codebook(rendered.detach()[places], labels[places].long())}
         return {name: object_codebook.WEIGHTS[name] * value for name, value in terms.items()}
 
-    def _terms_of_codes(self, drawn: Tensor, labels: Tensor, places: Tensor, generator: torch.Generator) -> Terms:
+    def _terms_of_codes(self, rendered: Tensor, labels: Tensor, places: Tensor, generator: torch.Generator) -> Terms:
         chosen = places[object_codebook.sampled(len(places), generator).to(places.device)]
-        # Determinism: the gradient of drawn[chosen] depends on the number of threads.
-        samples = torch.nn.functional.embedding(chosen, drawn)
+        # Determinism: the gradient of rendered[chosen] depends on the number of threads.
+        samples = torch.nn.functional.embedding(chosen, rendered)
         return {
             "contrast": object_codebook.contrast(samples, labels[chosen].long()),
-            "norms": object_codebook.norms(drawn, labels != IGNORE),
+            "norms": object_codebook.norms(rendered, labels != IGNORE),
         }
 
-    def _terms_of_codebook(self, drawn: Tensor, labels: Tensor) -> Terms:
-        """Return the terms of labelled pixels; drawn: [P, C] without gradient. labels: [P] ranks."""
+    def _terms_of_codebook(self, rendered: Tensor, labels: Tensor) -> Terms:
+        """Return the terms of labelled pixels; rendered: [P, C] without gradient. labels: [P] ranks."""
         codes, codebook = self.options.codes, self.learned.classifier
         ids, group = torch.unique(labels, return_inverse=True)
-        masses, largest = object_codebook.code_masses(codebook, drawn, group, len(ids), codes)
+        masses, largest = object_codebook.code_masses(codebook, rendered, group, len(ids), codes)
         targets = object_codebook.matching(masses)[group]
-        counted = object_codebook.reliable(drawn, group, len(ids)).nonzero()[:, 0]
+        counted = object_codebook.reliable(rendered, group, len(ids)).nonzero()[:, 0]
         if len(counted) == 0:
             return {}
-        drawn, own_codes = drawn[counted], targets[counted]
-        terms = {"concentration": object_codebook.concentration(codebook.weight, drawn, own_codes)}
+        rendered, own_codes = rendered[counted], targets[counted]
+        terms = {"concentration": object_codebook.concentration(codebook.weight, rendered, own_codes)}
         if bool((largest != targets).any()):
-            terms["classes"] = object_codebook.selection(codebook, drawn, own_codes, codes)
+            terms["classes"] = object_codebook.selection(codebook, rendered, own_codes, codes)
         return terms
 
     @torch.no_grad()
@@ -128,8 +128,8 @@ class CodebookTraining(CodeTraining):
                 labels = self.ranks.ranked_labels(scene.labels[index]).flatten()
                 places = (labels != IGNORE).nonzero()[:, 0]
                 if len(places):
-                    drawn = self.learned.drawn(surfels, camera).flatten(0, 1)[places]
-                    largest = object_codebook.largest_codes(self.learned.classifier, drawn, codes)
+                    rendered = self.learned.rendered(surfels, camera).flatten(0, 1)[places]
+                    largest = object_codebook.largest_codes(self.learned.classifier, rendered, codes)
                     keys = labels[places].long() * codes + largest
                     yield torch.bincount(keys, minlength=len(self.ranks) * codes).view(-1, codes)
                 progress(index + 1, len(scene.cameras))

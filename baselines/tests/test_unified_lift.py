@@ -61,7 +61,7 @@ def test_weights_and_rates(monkeypatch):
     weights = {name: float(value.detach() / plain[name].detach()) for name, value in found.items()}
     expected = {"contrast": 1e-6, "norms": 1e-6, "classes": 1e-4, "concentration": 1.0}
     assert weights == pytest.approx(expected, rel=1e-4)
-    drawn = training.learned.drawn(training.scene.surfels().detach(), training.scene.cameras[0]).flatten(0, 1)
+    drawn = training.learned.rendered(training.scene.surfels().detach(), training.scene.cameras[0]).flatten(0, 1)
     every = torch.ones(len(drawn), dtype=torch.bool)
     assert float(object_codebook.norms(drawn, every).detach()) == pytest.approx(float(plain["norms"].detach()))
     assert [(group["lr"], group["eps"]) for group in training.learned.adam.param_groups] == [
@@ -130,12 +130,12 @@ def test_unlabelled_pixels_enter_no_term():
     one, other = trained(scene=scene), trained(scene=scene)
     found = one.terms(given, 0, dict)
     weights = hidden[..., None].expand(-1, -1, 16).flatten(0, 1)
-    drawn = other.learned.drawn
+    drawn = other.learned.rendered
 
     def disturbed(surfels, camera):
         return torch.where(weights.view(*hidden.shape, 16), 9.0, drawn(surfels, camera))
 
-    other.learned.drawn = disturbed  # pyright: ignore[reportAttributeAccessIssue]
+    other.learned.rendered = disturbed  # pyright: ignore[reportAttributeAccessIssue]
     again = other.terms(given, 0, dict)
     assert {name: value.item() for name, value in found.items()} == {n: v.item() for n, v in again.items()}
 

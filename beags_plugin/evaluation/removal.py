@@ -20,22 +20,22 @@ def removal_metrics(
     """Return PSNR and SSIM against the exact picture where the object was, and the share of the object that remains.
 
     rendered: [H, W, 3] float in 0..1, the scene without the object's Gaussians. photo, exact: the same view with and
-    without the object. silhouette: [H, W] bool. known: [H, W] bool, pixels whose surface in the exact
-    picture some training photo shows, or None. All metrics are over the silhouette; SSIM is the mean of its map, whose
-    windows reach outside. The object remains in a pixel if the rendering is nearer to the photo than to the exact
+    without the object. silhouette: [H, W] bool. known: [H, W] bool, pixels whose surface in the exact picture
+    some training photo shows, or None. All metrics are over the silhouette; SSIM is the mean of its map, whose windows
+    reach outside. The object remains in a pixel if the rendering is nearer to the photo than to the exact
     picture; only pixels where these two differ by ``TELLING`` or more count. A metric without pixels is None.
     """
     if not silhouette.any():
         return RemovalMetrics(None, None, None, None, None)
     similar = ssim_map(rendered, exact)[silhouette].mean()
-    drawn, shown, empty = rendered[silhouette], photo[silhouette], exact[silhouette]
-    telling = (shown - empty).norm(dim=-1) >= TELLING
-    remains = ((drawn - shown).norm(dim=-1) < (drawn - empty).norm(dim=-1))[telling]
-    there = torch.zeros_like(telling) if known is None else known[silhouette]
+    rendered, photo, exact = rendered[silhouette], photo[silhouette], exact[silhouette]
+    telling = (photo - exact).norm(dim=-1) >= TELLING
+    remains = ((rendered - photo).norm(dim=-1) < (rendered - exact).norm(dim=-1))[telling]
+    shown = torch.zeros_like(telling) if known is None else known[silhouette]
     return RemovalMetrics(
-        psnr(drawn, empty),
-        psnr(drawn[there], empty[there]) if there.any() else None,
-        None if known is None else float(there.double().mean()),
+        psnr(rendered, exact),
+        psnr(rendered[shown], exact[shown]) if shown.any() else None,
+        None if known is None else float(shown.double().mean()),
         float(similar),
         float(remains.double().mean()) if len(remains) else None,
     )

@@ -40,18 +40,18 @@ class RunMetrics:
     def stages(self) -> dict[Stage, SceneMetrics]:
         """Return the states that exist, in order."""
         both = {"before": self.before, "after": self.after}
-        return {stage: found for stage in STAGES if (found := both[stage]) is not None}
+        return {stage: metrics for stage in STAGES if (metrics := both[stage]) is not None}
 
     def names(self) -> dict[int, str]:
         """Return object id to a unique name: a name used twice gets its id appended."""
         names = {class_id: self.classes.get(class_id, f"object {class_id}") for class_id in self.after.objects}
-        taken = list(names.values())
-        return {c: f"{name} ({c})" if taken.count(name) > 1 else name for c, name in names.items()}
+        given_names = list(names.values())
+        return {c: f"{name} ({c})" if given_names.count(name) > 1 else name for c, name in names.items()}
 
     def worst(self) -> str | None:
         """Return the name of the object with the lowest extracted BIoU in the final state; None if none was scored."""
         names = self.names()
-        scores = {c: found.extracted.biou for c, found in self.after.objects.items() if found.extracted is not None}
+        scores = {c: each.extracted.biou for c, each in self.after.objects.items() if each.extracted is not None}
         known = {c: score for c, score in scores.items() if score is not None}
         return names[min(known, key=lambda c: known[c])] if known else None
 
@@ -142,9 +142,9 @@ class DataSetMetrics:
                     rows.append([run.scene, name, stage, *_cells(scene.objects[class_id]), *no_images])
                 images = [finite(getattr(scene, name)) for name in IMAGE_FIGURES]
                 rows.append([run.scene, "", stage, *_cells(scene.mean), *images])
-        for stage, found in self.means.items():
+        for stage, metrics in self.means.items():
             images = [finite(of_stage[stage]) for of_stage in self.images.values()]
-            rows.append([self.name, "", stage, *_cells(found), *images])
+            rows.append([self.name, "", stage, *_cells(metrics), *images])
         return rows
 
 
@@ -163,12 +163,12 @@ def data_set(name: str, runs: Sequence[RunMetrics]) -> DataSetMetrics:
                 kinds[stage][kind] = mean_metrics(getattr(scene.mean, kind) for scene in scenes)
 
     def of_images(metric: str) -> dict[Stage, float | None]:
-        found: dict[Stage, float | None] = dict.fromkeys(STAGES)
+        by_stage: dict[Stage, float | None] = dict.fromkeys(STAGES)
         for stage, scenes in _comparable(runs, lambda scene: getattr(scene, metric)).items():
             pooled = protocol.data_set_average == "pooled"
             units = [view for scene in scenes for view in scene.views] if pooled else scenes
-            found[stage] = mean(getattr(unit, metric) for unit in units)
-        return found
+            by_stage[stage] = mean(getattr(unit, metric) for unit in units)
+        return by_stage
 
     images = {name: of_images(name) for name in IMAGE_FIGURES}
     means: dict[Stage, ObjectMetrics] = {}
@@ -181,10 +181,10 @@ def data_set(name: str, runs: Sequence[RunMetrics]) -> DataSetMetrics:
 
 def _comparable(runs: Sequence[RunMetrics], has: Callable[[SceneMetrics], Any]) -> dict[Stage, list[SceneMetrics]]:
     """Return stage to the scenes with a metric; no "before" unless all of them have it."""
-    found = [run for run in runs if has(run.after) is not None]
-    scenes: dict[Stage, list[SceneMetrics]] = {"after": [run.after for run in found]}
-    before = [run.before for run in found if run.before is not None and has(run.before) is not None]
-    if len(before) == len(found):
+    comparable = [run for run in runs if has(run.after) is not None]
+    scenes: dict[Stage, list[SceneMetrics]] = {"after": [run.after for run in comparable]}
+    before = [run.before for run in comparable if run.before is not None and has(run.before) is not None]
+    if len(before) == len(comparable):
         scenes = {"before": before, **scenes}
     return scenes
 

@@ -111,10 +111,10 @@ def evaluate_scene(
                         near = MaskRenderer(surfels, members, part, rasterizer, settings, protocol)
                         mask, band = near.masks("extracted", [class_id])[class_id], band_of(view, protocol.band_share)
                         agreement = mask_metrics(mask.prediction, mask.truth, mask.ignore, protocol, band)
-                        drawn = near.image(surfels, background)
+                        rendered = near.image(surfels, background)
                         if colors_fitted:  # The fit is that of the whole photo.
-                            drawn = fitted_colors(drawn, affine).to(drawn)
-                        metrics = close_up_metrics(part, class_id, drawn, agreement)
+                            rendered = fitted_colors(rendered, affine).to(rendered)
+                        metrics = close_up_metrics(part, class_id, rendered, agreement)
                         masks.append(MaskRecord("close_up", class_id, index, mask.source, metrics))
                 for class_id, exact, silhouette, known in removals(view, [] if objects_alone else objects):
                     assert members is not None

@@ -28,15 +28,15 @@ def shown_pixels(
     Every view is rendered once; one training view is held at a time.
     """
     depths = list(render_depths(surfels.detach(), held_out, rasterizer, settings, "median"))
-    shown = [torch.zeros_like(depth, dtype=torch.bool) for depth in depths]
+    masks = [torch.zeros_like(depth, dtype=torch.bool) for depth in depths]
     maps = PixelMaps([*held_out, *training])
     surfaces = render_depths(surfels.detach(), training, rasterizer, settings, "median")
     for index, surface in enumerate(surfaces, start=len(held_out)):
         height, width = surface.shape
-        for depth, mask, A, b in zip(depths, shown, *maps.towards(index), strict=False):
+        for depth, mask, A, b in zip(depths, masks, *maps.towards(index), strict=False):
             rows, columns = torch.nonzero((depth > 0) & ~mask, as_tuple=True)
             far = depth[rows, columns]
             x, y = columns.to(far) + 0.5, rows.to(far) + 0.5
             lands, pixel, z = landing(x, y, far, (A, b), (width, height), far > 0)
             mask[rows[lands], columns[lands]] = (z - surface.reshape(-1)[pixel]).abs() <= TAU * z
-    return shown
+    return masks

@@ -81,20 +81,20 @@ def render_run(
     return Group(*parts, *(Text(line) for line in (*lines, *run.notes, protocol_line([run]))))
 
 
-def render_data_set(found: DataSetMetrics) -> RenderableType:
+def render_data_set(metrics: DataSetMetrics) -> RenderableType:
     """Return tables of several runs: the means of each scene, its worst object, then the means of the data set."""
     from rich.console import Group
     from rich.text import Text
 
-    content = found.to_json()
-    stages: list[Stage] = [stage for stage in ("before", "after") if any(stage in run.stages() for run in found.runs)]
+    content = metrics.to_json()
+    stages: list[Stage] = [stage for stage in ("before", "after") if any(stage in run.stages() for run in metrics.runs)]
     scenes: list[list[_Row]] = []
-    for run, scene in zip(found.runs, content["scenes"], strict=True):
+    for run, scene in zip(metrics.runs, content["scenes"], strict=True):
         scenes.append([(run.scene, scene["mean"], scene), *_worst(scene)])
-    scenes.append([(found.name, content["mean"], content)])
+    scenes.append([(metrics.name, content["mean"], content)])
     table = _mask_table("All scenes", "scene", [row for scene in scenes for row in scene], stages)
     more = _more_tables("All scenes", "scene", [scene[0] for scene in scenes], stages)
-    return Group(table, *more, Text(protocol_line(found.runs)))
+    return Group(table, *more, Text(protocol_line(metrics.runs)))
 
 
 def protocol_line(runs: Sequence[RunMetrics]) -> str:
@@ -152,25 +152,27 @@ def _worst(run: Mapping[str, Any]) -> list[_Row]:
     return [] if name is None or len(run["objects"]) < 2 else [(f"worst: {name}", run["objects"][name], None)]
 
 
-def _mask_table(what: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> RenderableType:
+def _mask_table(caption: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> RenderableType:
     """Return a table of all kinds of mask metrics per stage, with PSNR and SSIM if any row has images."""
     # The metric covered is in files only: one more column is too many for a terminal.
     columns = [(kind, metric) for kind in MASK_KINDS for metric in FIGURES[kind] if metric != "covered"]
     columns = [c for c in columns if c[0] != "seen" or (c[1] in ("iou", "biou") and _known(rows, stages, *c))]
     meaning = " (before: assignment alone; after: after refinement)" if len(stages) == 2 else ""
-    return _table(f"{what}: masks, %{meaning}", first, rows, stages, columns)
+    return _table(f"{caption}: masks, %{meaning}", first, rows, stages, columns)
 
 
-def _more_tables(what: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> Iterator[RenderableType]:
+def _more_tables(caption: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> Iterator[RenderableType]:
     """Yield a table of removals and one of close-ups, each if any row has such metrics."""
     plain = [(name, row, None) for name, row, _ in rows]
     if _known(rows, stages, "removal", "psnr"):
         columns = [("removal", m) for m in FIGURES["removal"] if "shown" not in m or _known(rows, stages, "removal", m)]
-        title = f"{what}: objects removed, PSNR in dB, pixels shown and remains in %"
+        title = f"{caption}: objects removed, PSNR in dB, pixels shown and remains in %"
         yield _table(title, first, plain, stages, columns)
     columns = [("close_up", metric) for metric in FIGURES["close_up"]]
     if any(_known(rows, stages, *column) for column in columns):
-        yield _table(f"{what}: objects at the photos' own size, PSNR in dB, masks in %", first, plain, stages, columns)
+        yield _table(
+            f"{caption}: objects at the photos' own size, PSNR in dB, masks in %", first, plain, stages, columns
+        )
 
 
 def _known(rows: Sequence[_Row], stages: Sequence[Stage], kind: str, metric: str) -> bool:

@@ -64,10 +64,10 @@ def seen_truth(view: EvalView, class_id: int) -> Truth | None:
 def removals(view: EvalView, objects: Sequence[int]) -> Iterator[tuple[int, Tensor, Tensor, Tensor | None]]:
     """Yield the objects whose removal can be scored: id, exact picture [H, W, 3], silhouette and known part [H, W]."""
     for class_id, exact in (view.removed or {}).items():
-        silhouette, shown = _of(view.silhouettes, class_id), _of(view.removed_shown, class_id)
+        silhouette, by_photos = _of(view.silhouettes, class_id), _of(view.removed_shown, class_id)
         if class_id in objects and silhouette is not None:
             height, width = exact.shape[:2]
-            known = None if shown is None else resized(shown, height, width)
+            known = None if by_photos is None else resized(by_photos, height, width)
             yield class_id, exact, resized(silhouette, height, width), known
 
 

@@ -52,9 +52,9 @@ class CompressedPlyImporter(Importer):
                 raise ValueError("it lacks ranges for its Gaussians")
             of = np.arange(len(vertex)) // _CHUNK
             color = _parts(vertex["packed_color"], (8, 8, 8, 8))
-            shown = color[:, :3]
+            rgb = color[:, :3]
             if "min_r" in (chunk.dtype.names or ()):
-                shown = _between(chunk, of, shown, ("r", "g", "b"))
+                rgb = _between(chunk, of, rgb, ("r", "g", "b"))
             three = (_parts(vertex["packed_rotation"], (10, 10, 10)) - 0.5) * math.sqrt(2)
             rest = np.zeros((len(vertex), 0, 3))
             if sh is not None:
@@ -71,7 +71,7 @@ class CompressedPlyImporter(Importer):
                     chunk, of, _parts(vertex["packed_scale"], (11, 10, 11)), ("scale_x", "scale_y", "scale_z")
                 ),
                 color[:, 3],
-                (shown - 0.5) / SH_C0,
+                (rgb - 0.5) / SH_C0,
                 rest,
             )  # fmt: skip
         if DISC_COMMENT.encode() in _header(path):

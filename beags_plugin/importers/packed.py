@@ -102,10 +102,10 @@ def joined(parts: Sequence[Gaussians]) -> Gaussians:
     width = max(part.sh_rest.shape[1] for part in parts)
 
     def values(part: Gaussians, name: str) -> Tensor:
-        found = getattr(part, name)
+        tensor = getattr(part, name)
         if name == "sh_rest":
-            return torch.cat([found, found.new_zeros(len(found), width - found.shape[1], 3)], dim=1)
-        return found
+            return torch.cat([tensor, tensor.new_zeros(len(tensor), width - tensor.shape[1], 3)], dim=1)
+        return tensor
 
     return Gaussians(**{name: torch.cat([values(part, name) for part in parts]) for name in vars(parts[0])})
 
@@ -137,9 +137,9 @@ def in_world(
 
 def _far(means: Tensor) -> Tensor | None:
     """Return means [N, 3] float64 if they lie far from 0 relative to their extent; else None."""
-    known = means[means.isfinite().all(dim=1)]
-    if not len(known):
+    finite = means[means.isfinite().all(dim=1)]
+    if not len(finite):
         return None
-    middle = known.median(dim=0).values
-    spread = (known - middle).abs().median()
+    middle = finite.median(dim=0).values
+    spread = (finite - middle).abs().median()
     return means if float(middle.abs().max()) > FAR * float(spread) else None

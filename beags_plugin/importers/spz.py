@@ -82,13 +82,13 @@ def _unzipped(content: bytes) -> tuple[int, int, int, int, list[np.ndarray]]:
     sizes = _sizes(version, count, degree)
     if sum(sizes) > MOST_ZIPPED * len(content):
         raise ValueError(f"it promises {count} Gaussians, which do not fit into it")
-    found = []
+    parts = []
     for size in sizes:
         part = stream.read(size)
         if len(part) < size:
             raise ValueError("it ends too early")
-        found.append(np.frombuffer(part, np.uint8))
-    return version, count, degree, bits, found
+        parts.append(np.frombuffer(part, np.uint8))
+    return version, count, degree, bits, parts
 
 
 def _streams(content: bytes) -> tuple[int, int, int, int, list[np.ndarray]]:
@@ -103,15 +103,15 @@ def _streams(content: bytes) -> tuple[int, int, int, int, list[np.ndarray]]:
         raise ValueError(f"it promises {count} Gaussians, which do not fit into it")
     _check_axes(content[_HEADER:place])
     table = [struct.unpack_from("<QQ", content, place + 16 * number) for number in range(streams)]
-    at, found, unpack = place + 16 * streams, [], zstandard().ZstdDecompressor()
+    at, parts, unpack = place + 16 * streams, [], zstandard().ZstdDecompressor()
     for number, size in enumerate(sizes):
         packed, promised = table[number] if number < streams else (0, 0)
         if promised != size or at + packed > len(content):
             raise ValueError(f"its stream {number} has {promised} bytes instead of {size}")
         part = _unpacked(unpack, content[at : at + packed], size) if size else b""
-        found.append(np.frombuffer(part, np.uint8))
+        parts.append(np.frombuffer(part, np.uint8))
         at += packed
-    return version, count, degree, bits, found
+    return version, count, degree, bits, parts
 
 
 def _check_axes(records: bytes) -> None:

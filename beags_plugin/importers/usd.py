@@ -80,10 +80,10 @@ def _gaussians(prim: Any) -> tuple[Gaussians, int]:
     count = len(means)
 
     def of_each(name: str, width: int, rows: int, default: list[float]) -> np.ndarray:
-        found = values(name, width)
-        if found is None or len(found) < rows:  # the schemas define this default
+        column = values(name, width)
+        if column is None or len(column) < rows:  # the schemas define this default
             return np.tile(np.array(default), (rows, 1))
-        return found[:rows]
+        return column[:rows]
 
     degree = int(prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get() or 0)
     bases = num_sh_bases(degree)

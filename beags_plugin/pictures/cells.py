@@ -22,12 +22,12 @@ Square = tuple[int, int, int]
 """(top, left, side) in pixels; it may extend beyond the image."""
 
 
-def square_around(shown: np.ndarray) -> Square:
-    """Return the square around the True pixels of ``shown`` [H, W] bool with a margin; else the whole image."""
-    height, width = shown.shape
-    if not shown.any():
+def square_around(mask: np.ndarray) -> Square:
+    """Return the square around the True pixels of ``mask`` [H, W] bool with a margin; else the whole image."""
+    height, width = mask.shape
+    if not mask.any():
         return 0, 0, max(height, width)
-    ys, xs = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
+    ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     side = int(max(ys[-1] - ys[0], xs[-1] - xs[0]) + 1)
     side = max(8, round(side * (1 + 2 * MARGIN)))
     return int((ys[0] + ys[-1] + 1 - side) // 2), int((xs[0] + xs[-1] + 1 - side) // 2), side

@@ -45,13 +45,13 @@ def contact_sheet(
     chosen = views[:: max(1, len(views) // count)][:count]
     if not (chosen or objects):
         raise ValueError("a contact sheet needs a view or an object")
-    done: list[list[np.ndarray]] = []
+    cell_groups: list[list[np.ndarray]] = []
     total = len(objects) + len(chosen)
 
     def finished(cells: list[np.ndarray]) -> list[np.ndarray]:
-        done.append(cells)
+        cell_groups.append(cells)
         if progress is not None:
-            progress(len(done), total)
+            progress(len(cell_groups), total)
         return cells
 
     shots = [

@@ -82,12 +82,12 @@ def contradicted_picture(
     """
     dotted, compared = [], []
     for view in pointed:
-        shown = overlay(read_image(view.photo, lambda image: np.array(image.convert("RGB"))), view.given)
+        photo = overlay(read_image(view.photo, lambda image: np.array(image.convert("RGB"))), view.given)
         height, width = view.given.shape
         for place, color in zip(view.places, colorize(view.others), strict=True):
-            _dot(shown, place * [width, height], color)
+            _dot(photo, place * [width, height], color)
         caption = f"{view.name}: {len(view.places)} points in the colours of the other views"
-        dotted.append([cell(shown, _size(view.given, 2 * _WIDTH), caption)])
+        dotted.append([cell(photo, _size(view.given, 2 * _WIDTH), caption)])
     for view, boxes in framed:
         masks = [view.photo if view.given is None else overlay(view.photo, view.given), overlay(view.photo, view.voted)]
         for mask in masks:
@@ -143,8 +143,8 @@ def coverage_picture(
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     axes.set_facecolor("white")
-    known = table[np.isfinite(table)]
-    low, high = (float(known.min()), float(known.max())) if len(known) else (0.1, 100.0)
+    finite = table[np.isfinite(table)]
+    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.1, 100.0)
     image = axes.imshow(
         table, aspect="auto", interpolation="nearest", cmap="viridis", norm=LogNorm(low, max(high, 1.001 * low))
     )

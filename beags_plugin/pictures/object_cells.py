@@ -154,8 +154,8 @@ def over_board(image: np.ndarray, size: int) -> np.ndarray:
 def _in_view(view: EvalView, class_id: int, stages: Mapping[str, Surfels], drawing: Drawing) -> _Shot:
     """Return the square of a view, at the resolution of its file, around the object at all stages and in truth."""
     truth, size = extracted_truth(view, class_id), (view.camera.height, view.camera.width)
-    shown = np.zeros(size, dtype=bool) if truth is None else resize_nearest(truth.mask.cpu().numpy(), *size)
-    window = _shown(shown, view.camera, drawing.settings, stages, drawing.rasterizer)
+    mask = np.zeros(size, dtype=bool) if truth is None else resize_nearest(truth.mask.cpu().numpy(), *size)
+    window = _shown(mask, view.camera, drawing.settings, stages, drawing.rasterizer)
     full = view.camera if view.full is None else view.full.camera
     ratio = full.width / view.camera.width
     top, left, length = (round(ratio * each) for each in window)
@@ -164,12 +164,12 @@ def _in_view(view: EvalView, class_id: int, stages: Mapping[str, Surfels], drawi
 
 
 def _shown(
-    shown: np.ndarray, camera: Camera, settings: RasterSettings, stages: Mapping[str, Surfels], rasterizer: Rasterizer
+    mask: np.ndarray, camera: Camera, settings: RasterSettings, stages: Mapping[str, Surfels], rasterizer: Rasterizer
 ) -> Square:
-    """Return the square around the pixels of ``shown`` [H, W] bool and all that the object covers at any stage."""
+    """Return the square around the pixels of ``mask`` [H, W] bool and all that the object covers at any stage."""
     for surfels in stages.values():
-        shown = shown | (alone(surfels, camera, settings, rasterizer)[..., 3] > 255 * FAINT)
-    return square_around(shown)
+        mask = mask | (alone(surfels, camera, settings, rasterizer)[..., 3] > 255 * FAINT)
+    return square_around(mask)
 
 
 def _photo(view: EvalView, full: Camera, window: Square) -> np.ndarray | None:

@@ -94,10 +94,10 @@ def least_shown(stand: OrbitFrame, cameras: Sequence[Camera], elevation: float) 
 
     cameras: the photos' cameras. Without any that has the centre in its picture, the azimuth is 180.
     """
-    shown = [camera for camera in cameras if shows(camera, stand.center)]
-    if not shown:
+    showing = [camera for camera in cameras if shows(camera, stand.center)]
+    if not showing:
         return 180.0
-    aways = torch.stack([camera.center for camera in shown]).double() - stand.center
+    aways = torch.stack([camera.center for camera in showing]).double() - stand.center
     sides = torch.stack([side(stand, azimuth, elevation) for azimuth in range(0, 360, _STEP)])
     nearest = (sides @ torch.nn.functional.normalize(aways, dim=1).T).amax(dim=1)
     return float(_STEP * int(nearest.argmin()))

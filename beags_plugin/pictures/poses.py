@@ -23,8 +23,8 @@ def draw_poses(path: Path, poses: np.ndarray, points: np.ndarray, colors: np.nda
     side = np.linalg.svd(np.eye(3) - np.outer(up, up))[0][:, :2]
     axes = np.stack([side[:, 0], side[:, 1], up], axis=1)
     centers, looks = poses[:, :3, 3] @ axes, -poses[:, :3, 2] @ axes
-    some = np.random.default_rng(0).permutation(len(points))[:_SHOWN]
-    points, colors = points[some] @ axes, colors[some] / 255.0
+    chosen = np.random.default_rng(0).permutation(len(points))[:_SHOWN]
+    points, colors = points[chosen] @ axes, colors[chosen] / 255.0
     middle = np.median(centers, axis=0)
     reach = 2.0 * float(np.linalg.norm(centers - middle, axis=1).max() or 1.0)
     length = 0.12 * reach

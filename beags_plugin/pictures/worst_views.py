@@ -99,7 +99,7 @@ def draw_worst(
     (done, total) masks.
     """
     names = run.names()
-    found = []
+    masks = []
     chosen: list[tuple[MaskKind, int]] = [(kind, index) for kind in _KINDS for index in worst_records(run, kind, count)]
     with torch.no_grad():
         for kind, index in chosen:
@@ -113,10 +113,10 @@ def draw_worst(
             metrics: dict[Stage, Any] = {stage: scene.masks[index].metrics for stage, scene in run.stages().items()}
             photo = _photo(view, errors["after"].shape)
             title = f"{run.scene}, {view.name}: {names[record.class_id]}"
-            found.append(WorstMask(title, kind, photo, errors, metrics))
+            masks.append(WorstMask(title, kind, photo, errors, metrics))
             if progress is not None:
-                progress(len(found), len(chosen))
-    return found
+                progress(len(masks), len(chosen))
+    return masks
 
 
 def _photo(view: EvalView, shape: tuple[int, ...]) -> np.ndarray:

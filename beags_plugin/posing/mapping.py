@@ -35,9 +35,9 @@ def match(
     geometry = pycolmap.TwoViewGeometryOptions()
     geometry.ransac.random_seed = SEED
     for first in range(0, len(pairs), AT_ONCE):
-        some = pairs[first : first + AT_ONCE]
+        batch = pairs[first : first + AT_ONCE]
         with tempfile.NamedTemporaryFile("w", suffix=".txt", encoding="utf-8") as file:
-            file.writelines(f"{keys[one]} {keys[other]}\n" for one, other in some)
+            file.writelines(f"{keys[one]} {keys[other]}\n" for one, other in batch)
             file.flush()
             pairing = pycolmap.ImportedPairingOptions(match_list_path=file.name)
             pycolmap.match_image_pairs(database, matching, pairing, geometry, pycolmap.Device.cpu)

@@ -69,24 +69,24 @@ class Look:
 
 def find_photos(data: Path) -> list[Path]:
     """Return the photos of a folder, or of ``images`` in it, by name; raises ``UserError`` for too few."""
-    folder, found = folder_of_photos(data), list_photos(data)
-    photo_names(found)
-    others = Counter(path.suffix.lower() for path in folder.iterdir() if path.is_file() and path not in set(found))
+    folder, photos = folder_of_photos(data), list_photos(data)
+    photo_names(photos)
+    others = Counter(path.suffix.lower() for path in folder.iterdir() if path.is_file() and path not in set(photos))
     if heic := others[".heic"] + others[".heif"]:
         raise UserError(f"{folder} holds HEIC photos ({heic}): convert them to JPEG, which other programs read too.")
-    if not found:
+    if not photos:
         raise UserError(
             f"{folder} holds no photos: give --data a folder of {', '.join(IMAGE_SUFFIXES)} files, or a video."
         )
-    if len(found) < FEWEST:
-        raise UserError(f"{folder} holds too few photos ({len(found)}): give at least {FEWEST}, better 40.")
-    return found
+    if len(photos) < FEWEST:
+        raise UserError(f"{folder} holds too few photos ({len(photos)}): give at least {FEWEST}, better 40.")
+    return photos
 
 
-def check_photos(found: Sequence[Path], folder: Path, bar: Bar) -> list[Photo]:
+def check_photos(paths: Sequence[Path], folder: Path, bar: Bar) -> list[Photo]:
     """Return the scene's photos, to be copied to ``folder``; raises ``UserError`` for photos that cannot be used."""
     with bar("photos") as progress:
-        return [_checked(path, folder / path.name) for path in counted(found, len(found), progress)]
+        return [_checked(path, folder / path.name) for path in counted(paths, len(paths), progress)]
 
 
 def _checked(source: Path, path: Path) -> Photo:

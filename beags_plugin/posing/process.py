@@ -119,20 +119,20 @@ def process(
     if wrong := [index for index in ignore_ids if not 0 <= index <= IGNORE]:
         raise UserError(f"ignore_ids holds {wrong[0]}: ids are whole numbers in 0..{IGNORE}.")
 
-    def given(photos: list[Photo]) -> list[Photo]:
+    def restricted(photos: list[Photo]) -> list[Photo]:
         return photos if masks is None else with_masks(photos, masks, ignore_ids)
 
     if masks is not None and not masks.is_dir():
         raise UserError(f"{masks} is no folder: give --masks that of the id images.")
-    found = find_frames(data, work / "frames", bar) if video else find_photos(data)
-    if list_images(images) and not (work / KEPT).exists() and found[0].parent.resolve() != images.resolve():
+    files = find_frames(data, work / "frames", bar) if video else find_photos(data)
+    if list_images(images) and not (work / KEPT).exists() and files[0].parent.resolve() != images.resolve():
         raise UserError(f"{images} holds photos already: give another --output-dir, or these as --data.")
-    photos = [] if video else given(check_photos(found, images, bar))
+    photos = [] if video else restricted(check_photos(files, images, bar))
     lock = run_lock(output, "being given poses")
     try:
         if video:
-            write_frames(data, found, bar)
-            photos = given(check_photos(found, images, bar))
+            write_frames(data, files, bar)
+            photos = restricted(check_photos(files, images, bar))
         with writing(output):
             return _process(photos, output, bar)
     finally:
@@ -200,10 +200,10 @@ def _report(photos: list[Photo], looks: list[Look], model: Any, groups: list[lis
     names = [photo.path.name for photo in photos]
     without = sorted(set(names) - set(groups[0]))
     notes = []
-    if found := blurred(looks):
-        notes.append(f"{_named(names, found)} look blurred beside their neighbours: leave out those that are.")
-    if found := repeated(looks):
-        notes.append(f"{_named(names, found)} show the same as an earlier photo: leave them out.")
+    if places := blurred(looks):
+        notes.append(f"{_named(names, places)} look blurred beside their neighbours: leave out those that are.")
+    if places := repeated(looks):
+        notes.append(f"{_named(names, places)} show the same as an earlier photo: leave them out.")
     sizes = sorted({(photo.width, photo.height) for photo in photos})
     if {size[::-1] for size in sizes} == set(sizes) and len(sizes) == 2:
         notes.append("Some photos are portrait and some landscape: each kind got a camera of its own.")
@@ -231,5 +231,5 @@ def _report(photos: list[Photo], looks: list[Look], model: Any, groups: list[lis
 
 
 def _named(names: list[str], which: list[int]) -> str:
-    shown = ", ".join(names[index] for index in which[:NAMED])
-    return shown if len(which) <= NAMED else f"{shown} and {len(which) - NAMED} more"
+    first = ", ".join(names[index] for index in which[:NAMED])
+    return first if len(which) <= NAMED else f"{first} and {len(which) - NAMED} more"

@@ -60,14 +60,13 @@ def poses_are_their_own(objects: Path, room: Path, masks: Path) -> bool:
     names = sorted(turns[0].keys() & turns[1].keys())
     if len(names) < max(2, ENOUGH * len(turns[1])):
         return False
-    between = np.array([turns[0][name].T @ turns[1][name] for name in names]).reshape(
-        -1, 9
-    )  # one rotation if both agree
+    # All of these are one rotation if both agree.
+    between = np.array([turns[0][name].T @ turns[1][name] for name in names]).reshape(-1, 9)
     cosine = (between @ between.T - 1) / 2
     if np.median(cosine[np.triu_indices(len(names), 1)]) > np.cos(np.deg2rad(TURN)):
         return False
-    own, given = (shares_explained(_features(model, masks))[0] for model in models)
-    return own > MORE * given
+    own, others = (shares_explained(_features(model, masks))[0] for model in models)
+    return own > MORE * others
 
 
 def _read(model: Path) -> Any:

@@ -14,9 +14,9 @@ def open3d_kernels() -> Any:
     This saves about 2 seconds of CPU, three quarters of the import. The whole package can still be imported later.
     Raises ``ImportError`` or ``OSError`` where Open3D, or a system library that it needs, is missing.
     """
-    known = sys.modules.get("open3d.cpu.pybind")
-    if known is not None and sys.modules.get("open3d", known) is not None:
-        return known
+    loaded = sys.modules.get("open3d.cpu.pybind")
+    if loaded is not None and sys.modules.get("open3d", loaded) is not None:
+        return loaded
     spec = None if "open3d" in sys.modules else find_spec("open3d")
     if spec is None or spec.submodule_search_locations is None or sys.platform != "linux":
         import open3d  # the package prepares what its libraries need on other systems

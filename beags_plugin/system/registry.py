@@ -42,10 +42,10 @@ class Registry:
 
     def register(self, name: str, spec: str) -> None:
         """Add ``name``; raises ``UserError`` if the name is taken by another spec."""
-        known = self._specs.setdefault(name, spec)
-        if known != spec:
+        first = self._specs.setdefault(name, spec)
+        if first != spec:
             raise UserError(
-                f"two {self.kind}s are called {name!r} ({known} and {spec}): rename or uninstall one of them."
+                f"two {self.kind}s are called {name!r} ({first} and {spec}): rename or uninstall one of them."
             )
 
     def names(self) -> list[str]:

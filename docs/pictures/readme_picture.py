@@ -50,8 +50,8 @@ class Picture:
         parts = {
             stage: select_class(scene.surfels(), scene.members, class_id)[0] for stage, scene in run.stages.items()
         }
-        shown = shown_scene(run.run).views
-        parts["after"] = parts["after"][clean(parts["after"], class_id, shown)[0]]
+        views = shown_scene(run.run).views
+        parts["after"] = parts["after"][clean(parts["after"], class_id, views)[0]]
         photos = run.run.viewpoints.cameras
         stand = orbit_frame(*bounding_box(parts["after"]), photos)
         cameras = orbit(stand, 12, self.height)

@@ -59,17 +59,17 @@ class Picture:
 
 def settled(page: Page) -> np.ndarray:
     """Return the page's picture once it has not changed for 15 seconds; coarse pictures come before fine ones."""
-    shown, since = _pixels(page), time.monotonic()
+    picture, since = _pixels(page), time.monotonic()
 
     def still() -> bool:
-        nonlocal shown, since
+        nonlocal picture, since
         now = _pixels(page)
-        if not np.array_equal(now, shown):
-            shown, since = now, time.monotonic()
+        if not np.array_equal(now, picture):
+            picture, since = now, time.monotonic()
         return time.monotonic() - since > 15.0
 
     page.wait(still, 300)
-    return shown
+    return picture
 
 
 def _pixels(page: Page) -> np.ndarray:

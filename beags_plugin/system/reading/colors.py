@@ -42,8 +42,8 @@ def as_bytes(colors: np.ndarray) -> np.ndarray:
     values, most = range_of(colors)
     if most is None:
         return np.full(values.shape, GREY, np.uint8)
-    known = np.isfinite(values).all(axis=1)
-    scaled = np.clip(np.where(known[:, None], values, GREY / 255.0 * most) * (255.0 / most) + 0.5, 0, 255)
+    finite = np.isfinite(values).all(axis=1)
+    scaled = np.clip(np.where(finite[:, None], values, GREY / 255.0 * most) * (255.0 / most) + 0.5, 0, 255)
     return scaled.astype(np.uint8)
 
 
@@ -57,11 +57,11 @@ def range_of(colors: np.ndarray) -> tuple[np.ndarray, float | None]:
         return values, 255.0
     if whole and colors.dtype.itemsize == 2:
         values[values < 0] += 65536  # 16 bits whose type should be unsigned
-    known = np.isfinite(values).all(axis=1)
-    if not known.any():
+    finite = np.isfinite(values).all(axis=1)
+    if not finite.any():
         return values, None
-    least, most = np.quantile(values[known], [1.0 - _MOST, _MOST])
-    highest = values[known].max()
+    least, most = np.quantile(values[finite], [1.0 - _MOST, _MOST])
+    highest = values[finite].max()
     if not whole and least >= -0.05 and most <= 1.05:
         return values, 1.0
     if least >= (0.0 if whole else -1.0) and (highest <= 255.0 or (not whole and most <= 256.0)):

@@ -227,8 +227,8 @@ def _number(file: BinaryIO, kind: str) -> np.generic:
     return np.frombuffer(content, dtype)[0]
 
 
-def _length(given: str | np.generic) -> int:
-    length = int(given)  # type: ignore[call-overload]
+def _length(word: str | np.generic) -> int:
+    length = int(word)  # type: ignore[call-overload]
     if length < 0:
         raise ValueError(f"it has a list of {length} elements")
     return length

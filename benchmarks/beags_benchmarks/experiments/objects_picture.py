@@ -69,31 +69,31 @@ def _objects(
     from beags_plugin.pictures.object_cells import alone, over_board
     from beags_plugin.runs.read import read_run
 
-    done = [trial for run in runs for trial in run.trials if outcomes[trial.digest].failed is None]
-    if not done:
+    finished = [trial for run in runs for trial in run.trials if outcomes[trial.digest].failed is None]
+    if not finished:
         return []
-    first = EvaluatedRun(outcomes[done[0].digest].folder / "run/config.yml")
-    scenes = {trial.digest: read_run(outcomes[trial.digest].folder / "run/config.yml") for trial in done}
+    first = EvaluatedRun(outcomes[finished[0].digest].folder / "run/config.yml")
+    scenes = {trial.digest: read_run(outcomes[trial.digest].folder / "run/config.yml") for trial in finished}
     rows = []
     for class_id, (view, truth) in sorted(_largest(first, most).items()):
         name = first.classes[class_id]
         assert view.image is not None
-        drawn: list[np.ndarray | None] = []
+        images: list[np.ndarray | None] = []
         for run in runs:
             trial = next((trial for trial in run.trials if _cuts(trial, name)), None)
-            found = None if trial is None else scenes.get(trial.digest)
+            trained = None if trial is None else scenes.get(trial.digest)
             image = None
-            if found is not None:
-                part = select_class(found.surfels(), found.members, class_id)[0]
+            if trained is not None:
+                part = select_class(trained.surfels(), trained.members, class_id)[0]
                 image = alone(part, view.camera, first.settings, first.rasterizer)
-            drawn.append(image)
-        shape = next((image.shape[:2] for image in drawn if image is not None), truth.shape)
+            images.append(image)
+        shape = next((image.shape[:2] for image in images if image is not None), truth.shape)
         window = square_around(truth if truth.shape == shape else np.ones(shape, dtype=bool))
         photo = as_bytes(view.image)
         white = np.full((_SIDE, _SIDE, 3), 255, np.uint8)
         pictures = [
             crop(photo, window),
-            *(white if image is None else over_board(crop(image, window), _SIDE) for image in drawn),
+            *(white if image is None else over_board(crop(image, window), _SIDE) for image in images),
         ]
         captions = captioned([f"{scene}: {name}", *(run.variant.name for run in runs)])
         rows.append([cell(image, (_SIDE, _SIDE), text) for image, text in zip(pictures, captions, strict=True)])
@@ -111,15 +111,15 @@ def _largest(run: EvaluatedRun, most: int) -> dict[int, tuple[EvalView, np.ndarr
     """Return the largest objects: id to the held-out view that shows most pixels of it, and its mask [H, W] bool."""
     from beags_plugin.evaluation.truths import extracted_truth
 
-    found: list[tuple[int, int, EvalView, np.ndarray]] = []
+    masks: list[tuple[int, int, EvalView, np.ndarray]] = []
     for class_id in sorted(run.classes):
         truths = [(view, extracted_truth(view, class_id)) for view in run.views] if class_id != 0 else []
         seen = [(int(truth.mask.sum()), view, truth.mask) for view, truth in truths if truth is not None]
         if seen:
             pixels, view, mask = max(seen, key=lambda each: each[0])
-            found.append((pixels, class_id, view, mask.cpu().numpy()))
-    found.sort(key=lambda each: -each[0])
-    return {class_id: (view, mask) for _, class_id, view, mask in found[:most]}
+            masks.append((pixels, class_id, view, mask.cpu().numpy()))
+    masks.sort(key=lambda each: -each[0])
+    return {class_id: (view, mask) for _, class_id, view, mask in masks[:most]}
 
 
 def _cuts(trial: Trial, name: str) -> bool:

@@ -73,9 +73,9 @@ def _bars(
             low.append(factor * value)
     if paper is not None and experiment.paper is not None:
         for mark, (index, column) in zip(_PAPER_MARKS, enumerate(experiment.paper.columns), strict=False):
-            shown = [(pairs[index][paper], place[n]) for n, pairs in experiment.paper.rows.items() if n in place]
-            if shown:
-                x, y = zip(*shown, strict=True)
+            points = [(pairs[index][paper], place[n]) for n, pairs in experiment.paper.rows.items() if n in place]
+            if points:
+                x, y = zip(*points, strict=True)
                 axes.plot(x, y, mark, color="#d94801", fillstyle="none", label=f"the paper's {column}", zorder=2)
                 low += x
         if labels and axes.get_legend_handles_labels()[0]:

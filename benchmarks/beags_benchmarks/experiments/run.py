@@ -60,10 +60,10 @@ def run_experiment(name: str, options: ExperimentOptions) -> list[ResultRow]:
     with open_engine(options) as engine:
         scenes = scenes_of(experiment, options)
         masks = {
-            (scene.name, variant.name): made
+            (scene.name, variant.name): folders
             for scene in scenes
             for variant in experiment.variants
-            if (made := _other_masks(scene, variant, options.output / "scenes", not options.plan)) is not None
+            if (folders := _other_masks(scene, variant, options.output / "scenes", not options.plan)) is not None
         }
         runs = plan(experiment, scenes, masks, code_of_trials())
         trials_folder = options.output / "trials"
@@ -192,11 +192,11 @@ def rows_of(runs: Sequence[VariantTrial], outcomes: dict[str, Outcome]) -> list[
     rows = []
     for run in runs:
         assert run.trial.base is not None
-        base, found = outcomes[run.trial.base.digest], [outcomes[trial.digest] for trial in run.trials]
-        failed = next((outcome.failed for outcome in found if outcome.failed), None)
-        result = found[0].result if failed is None else None
+        base, own = outcomes[run.trial.base.digest], [outcomes[trial.digest] for trial in run.trials]
+        failed = next((outcome.failed for outcome in own if outcome.failed), None)
+        result = own[0].result if failed is None else None
         if run.objects and result is not None:
-            results = zip(run.objects, (outcome.result for outcome in found), strict=True)
+            results = zip(run.objects, (outcome.result for outcome in own), strict=True)
             result = merged({name: each for name, each in results if each is not None})
         rows.append(make_row(run.variant, run.scene.name, run.seed, base.result, result, failed))
     return rows

@@ -123,8 +123,8 @@ def paper_table(paper: PaperFigures, reference: str | None) -> Table:
     for name, pairs in paper.rows.items():
         cells = []
         for index, (iou, biou) in enumerate(pairs):
-            left = f" ({100 * (100 - biou) / (100 - start[index][1]):.0f})" if start else ""
-            cells.append(f"{iou:.1f} / {biou:.1f}{left}")
+            share = f" ({100 * (100 - biou) / (100 - start[index][1]):.0f})" if start else ""
+            cells.append(f"{iou:.1f} / {biou:.1f}{share}")
         rows.append([name, *cells])
     return plain_table(title, ["variant", *paper.columns], rows)
 

@@ -25,9 +25,9 @@ def code_of_trials() -> str:
     packages = {point.value.partition(":")[0].partition(".")[0] for point in points} - {__name__.partition(".")[0]}
     files = [Path(__file__).with_name("measure.py")]
     for name in sorted(packages):
-        if (found := find_spec(name)) is not None and found.origin is not None:
-            file = Path(found.origin)
-            files += sorted(file.parent.rglob("*.py")) if found.submodule_search_locations else [file]
+        if (spec := find_spec(name)) is not None and spec.origin is not None:
+            file = Path(spec.origin)
+            files += sorted(file.parent.rglob("*.py")) if spec.submodule_search_locations else [file]
     return code_digest(*files)
 
 

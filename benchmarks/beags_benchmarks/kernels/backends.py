@@ -36,14 +36,14 @@ def run(name: str, scene: Scene) -> tuple[Seconds, Seconds, dict[str, Tensor], d
     floats = {leaf: leaves[leaf] for leaf in LEAVES if leaf != "background"}
     inputs = SurfelInputs(**floats, class_ids=scene.class_ids)
     start = Seconds.now()
-    found = rasterizer(name).rasterize(inputs, scene.camera, scene.settings, leaves["background"], scene.target)
-    images = {output: getattr(found, output) for output in OUTPUTS}
+    outputs = rasterizer(name).rasterize(inputs, scene.camera, scene.settings, leaves["background"], scene.target)
+    images = {output: getattr(outputs, output) for output in OUTPUTS}
     rendered = Seconds.now()
     loss = _Loss.apply([scene.gradients[name] for name in images], *images.values())
     grads = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
-    done = Seconds.now()
+    end = Seconds.now()
     gradients = {name: g for name, g in zip(leaves, grads, strict=True) if g is not None}
-    return rendered - start, done - rendered, images, gradients
+    return rendered - start, end - rendered, images, gradients
 
 
 class _Loss(torch.autograd.Function):

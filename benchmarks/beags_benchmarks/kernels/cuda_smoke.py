@@ -104,15 +104,15 @@ def _rendered(
     settings = RasterSettings(0.05, 100.0, geometry=geometry, distortion=distortion)
     background = scene.background.to(inputs.means.dtype)
     rendered = rasterizer.rasterize(inputs, scene.camera, settings, background, scene.target if boundary else None)
-    found = (
+    outputs = (
         rendered.color, rendered.alpha, rendered.depth, rendered.normal, rendered.median_depth, rendered.distortion,
         rendered.boundary,
     )  # fmt: skip
-    images = [image for image in found if image is not None]
+    images = [image for image in outputs if image is not None]
     leaves = [getattr(inputs, name) for name in (*LEAVES, "screen_shift")]
     return [*images, *_gradients(sum(image.square().sum() for image in images), leaves)]  # type: ignore[arg-type]
 
 
 def _gradients(value: Tensor, leaves: list[Tensor]) -> list[Tensor]:
-    found = torch.autograd.grad(value.sum(), leaves, allow_unused=True)
-    return [gradient for gradient in found if gradient is not None]
+    gradients = torch.autograd.grad(value.sum(), leaves, allow_unused=True)
+    return [gradient for gradient in gradients if gradient is not None]

@@ -141,10 +141,10 @@ def measure_sizes(session: Session, options: Options, result: Result, advance: A
     """Fill ``rows`` and ``scenes``."""
     for size in options.sizes:
         entries = list(session.entries(size, options, result.notes))
-        found = session.best.ask("describe", size=size.name)
-        result.scenes.append({"size": size.name, **found})
+        description = session.best.ask("describe", size=size.name)
+        result.scenes.append({"size": size.name, **description})
         timed = _interleave(session, size, entries, options, advance)
-        native_work = found["work"]
+        native_work = description["work"]
         for entry in entries:
             backend, isa, threads = entry
             forward, backward = timed[entry]["forward"], timed[entry]["backward"]
@@ -248,7 +248,7 @@ def measure_step(session: Session, options: Options, result: Result, advance: Ad
         "samples": kinds,
         "sampled_share": session.best.ask("sampled", size=size.name),
         "whole_ms": {kind: series.best for kind, series in whole.items()},
-        "parts_ms": {kind: {part: series.best for part, series in found.items()} for kind, found in parts.items()},
+        "parts_ms": {kind: {part: series.best for part, series in by_part.items()} for kind, by_part in parts.items()},
         "overhead": _overhead(session, options, rounds),
         "peak_mb": {},
     }
@@ -257,21 +257,21 @@ def measure_step(session: Session, options: Options, result: Result, advance: Ad
     if "step" in options.memory:
         for kind, samples in kinds.items():
             advance(work(size) * 3, f"{size.name} step {kind} memory")
-            what = {"size": size.name, "threads": threads, "samples": samples}
-            step["peak_mb"][kind] = peak_in_new_process(result.notes, f"a step, {kind}", **what)
+            arguments = {"size": size.name, "threads": threads, "samples": samples}
+            step["peak_mb"][kind] = peak_in_new_process(result.notes, f"a step, {kind}", **arguments)
     result.step = step
 
 
 def _overhead(session: Session, options: Options, rounds: int) -> dict[str, Any]:
     """Measure a small scene and an almost empty one, for the rasterizer and a whole step."""
     threads = options.threads[0]
-    found: dict[str, Series] = {}
+    timings: dict[str, Series] = {}
     for _ in range(rounds):
         for name, size in (("empty", EMPTY), ("small", options.overhead_size.name)):
             request = {"size": size, "threads": threads, "seconds": options.seconds}
-            found.setdefault(f"{name}_step", Series(threads)).values += session.best.ask("step", **request)["step"]
+            timings.setdefault(f"{name}_step", Series(threads)).values += session.best.ask("step", **request)["step"]
             answer = session.best.ask("time", backend="native", **request)
             for (wall, cpu), (more_wall, more_cpu) in zip(answer["forward"], answer["backward"], strict=True):
-                series = found.setdefault(f"{name}_rasterizer", Series(threads))
+                series = timings.setdefault(f"{name}_rasterizer", Series(threads))
                 series.values.append((wall + more_wall, cpu + more_cpu))
-    return {"size": options.overhead_size.name, **{f"{name}_ms": series.best for name, series in found.items()}}
+    return {"size": options.overhead_size.name, **{f"{name}_ms": series.best for name, series in timings.items()}}

@@ -112,7 +112,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
-    found = []
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
         named = {"tmp": folder, "run": str(options.run), "data": str(options.data), "object": options.object}
         for command, needs in (MISTAKES | WORK | OF_RUNS).items():
@@ -133,9 +133,9 @@ def main() -> None:
             end = f"refused {best.end:5.1f} s" if refusal else f"end     {best.end:5.1f} s"
             cpu = f"begun {best.begun:4.1f}  all {best.cpu:5.1f} s of CPU"
             print(f"{'met' if met else 'MISSED':>8}  first {best.first:5.1f} s  {end}  {cpu}  {command}", flush=True)
-            found.append(asdict(best) | {"met": met})
+            rows.append(asdict(best) | {"met": met})
     if options.json is not None:
-        options.json.write_text(json.dumps(found, indent=1) + "\n")
+        options.json.write_text(json.dumps(rows, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -181,7 +181,7 @@ def measure(config_path: Path, objects: Sequence[str]) -> None:
         sample = json.loads(described.read_text())
         things = {thing.name: thing for thing in FAMILIES[sample["family"]].scene(sample["seed"]).things}
     ids = {name: class_id for class_id, name in run.classes.items() if class_id}
-    found: dict[str, list[list[float]]] = {label: [] for label in VARIANTS}
+    by_variant: dict[str, list[list[float]]] = {label: [] for label in VARIANTS}
     for name in objects or ids:
         part, _ = select_class(scene.surfels(), scene.members, ids[name])
         views = [scored(run, part, view, ids[name]) for view in run.views]
@@ -192,10 +192,10 @@ def measure(config_path: Path, objects: Sequence[str]) -> None:
                 assert file.path is not None
                 row = figures(read_glb(file.path), np.array(exported.to_run), views, exact)
                 row.append(file.path.stat().st_size / 1e6)
-                found[file.format].append(row)
+                by_variant[file.format].append(row)
                 print(f"| {run.name} {name} | {VARIANTS[file.format]} | {formatted(row)} |", flush=True)
                 print(file.facts, file=sys.stderr)
-    for label, rows in found.items():
+    for label, rows in by_variant.items():
         print(f"| {run.name}, mean | {VARIANTS[label]} | {formatted(np.mean(rows, axis=0))} |", flush=True)
 
 
@@ -214,10 +214,10 @@ def measure_one_colour(config_path: Path, objects: Sequence[str]) -> None:
         kinds = part, seen_colors(part, training, lambda done: None).surfels
         rows = []
         for view in run.views:
-            drawn = [scored(run, kind, view, ids[name]) for kind in kinds]
-            both = drawn[0].inside & drawn[0].solid
+            renderings = [scored(run, kind, view, ids[name]) for kind in kinds]
+            both = renderings[0].inside & renderings[0].solid
             if both.sum() >= FEWEST:
-                rows.append([psnr(each.splats[both], each.photo[both]) for each in drawn])
+                rows.append([psnr(each.splats[both], each.photo[both]) for each in renderings])
         print("| {} {} | {:.2f} | {:.2f} |".format(run.name, name, *np.mean(rows, axis=0)), flush=True)
 
 
@@ -241,9 +241,9 @@ def scored(run, part, view, class_id: int) -> Scored:
     from beags_plugin.rasterizers.rendering import surfel_inputs
 
     inputs = surfel_inputs(part.detach(), view.camera)
-    drawn = run.rasterizer.rasterize(inputs, view.camera, run.settings, torch.zeros(3))
-    alpha = drawn.alpha.numpy()
-    color = np.clip(drawn.color.numpy() / np.maximum(alpha, 1e-3)[..., None], 0, 1)
+    render = run.rasterizer.rasterize(inputs, view.camera, run.settings, torch.zeros(3))
+    alpha = render.alpha.numpy()
+    color = np.clip(render.color.numpy() / np.maximum(alpha, 1e-3)[..., None], 0, 1)
     own = resize_nearest((view.visible == class_id).numpy(), view.camera.height, view.camera.width)
     inside = binary_erosion(own, np.ones((3, 3)))
     return Scored(view.camera, view.image.numpy(), inside, color, alpha > 0.5)

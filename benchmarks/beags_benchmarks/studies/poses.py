@@ -36,10 +36,10 @@ def given_poses(data: Path) -> dict[str, np.ndarray]:
     return {Path(model.images[i].name).stem: camera_to_world(model.images[i]) for i in model.reg_image_ids()}
 
 
-def errors(found: dict[str, np.ndarray], given: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def errors(estimated: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return the errors of rotation (degrees) and position (share of the extent) of the photos with both poses."""
-    names = sorted(found.keys() & given.keys())
-    ours, theirs = (np.stack([poses[name] for name in names]) for poses in (found, given))
+    names = sorted(estimated.keys() & reference.keys())
+    ours, theirs = (np.stack([poses[name] for name in names]) for poses in (estimated, reference))
     a, b = ours[:, :3, 3], theirs[:, :3, 3]
     middle = b.mean(0)
     u, s, v = np.linalg.svd((b - middle).T @ (a - a.mean(0)))
@@ -79,8 +79,8 @@ def main() -> None:
 
     report, _ = process(data, options.output, timed)
     frames = json.loads((options.output / "transforms.json").read_text())["frames"]
-    found = {Path(frame["file_path"]).stem: np.array(frame["transform_matrix"]) for frame in frames}
-    turned, moved = errors(found, given_poses(options.data))
+    poses = {Path(frame["file_path"]).stem: np.array(frame["transform_matrix"]) for frame in frames}
+    turned, moved = errors(poses, given_poses(options.data))
     figures = {
         "photos": report.photos,
         "registered": report.registered,

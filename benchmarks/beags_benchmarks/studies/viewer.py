@@ -64,8 +64,8 @@ def move_and_count(port: int, middle: list[float], seconds: float, heights: Any)
     threading.Thread(target=move, daemon=True).start()
     with suppress(ConnectionClosed):
         for raw in connection:
-            found = msgspec.msgpack.decode(cast(bytes, raw))
-            for message in found if isinstance(found, list) else [found]:
+            content = msgspec.msgpack.decode(cast(bytes, raw))
+            for message in content if isinstance(content, list) else [content]:
                 if message["type"] == "BackgroundImageMessage" and time.monotonic() - begin > SETTLING:
                     heights.put(Image.open(BytesIO(message["rgb_bytes"])).size[1])
     heights.put(None)

@@ -68,7 +68,7 @@ def find_captures(options: CapturesOptions) -> tuple[list[FoundCapture], list[st
     """
     _check(options)
     wanted = [capture for capture in CAPTURES if not options.scenes or capture.name in options.scenes]
-    found, lines = [], []
+    captures, lines = [], []
     for capture in wanted:
         folder = options.data_root / capture.name
         if not folder.is_dir():
@@ -79,15 +79,15 @@ def find_captures(options: CapturesOptions) -> tuple[list[FoundCapture], list[st
         except UserError as error:
             lines.append(f"{capture.name} is left out: {error}")
             continue
-        found.append(each)
+        captures.append(each)
         lines += notes
         if options.quick and not options.scenes:
             break
-    if not found:
+    if not captures:
         names = ", ".join(capture.name for capture in wanted)
         why = f" ({lines[0]})" if len(wanted) == 1 else ""
         raise UserError(f"{options.data_root} holds none of {names} that can be read{why}: name the folder above them.")
-    return found, lines
+    return captures, lines
 
 
 def _check(options: CapturesOptions) -> None:
@@ -110,8 +110,8 @@ def _found(capture: Capture, folder: Path, options: CapturesOptions) -> tuple[Fo
         _, views = opened.posed_views()
         longest = max(max(image_size(image)) for image in views.images)
         parser.downscale_factor = max(1.0, longest / (min(options.size, QUICK_SIZE) if options.quick else options.size))
-        made = parser.setup()
-        training, held_out = (made.get_dataparser_outputs(split) for split in ("train", "test"))
+        loader = parser.setup()
+        training, held_out = (loader.get_dataparser_outputs(split) for split in ("train", "test"))
     size = SceneSize.of(training)
     photos = TrialScene(capture.name, folder.resolve(), parser.downscale_factor, folder_digest(folder))
     if not capture.objects or options.truth is None:
@@ -150,12 +150,12 @@ def _truth_notes(capture: Capture, truth: Path, held_out: Mapping[str, Path]) ->
     return notes
 
 
-def kinds_of(found: Sequence[FoundCapture], options: CapturesOptions) -> list[tuple[FoundCapture, str]]:
+def kinds_of(captures: Sequence[FoundCapture], options: CapturesOptions) -> list[tuple[FoundCapture, str]]:
     """Return every capture with each requested kind of masks that it has; raises ``UserError`` if there is none."""
     pairs = [
-        (each, kind) for each in found for kind in each.capture.masks if not options.masks or kind in options.masks
+        (each, kind) for each in captures for kind in each.capture.masks if not options.masks or kind in options.masks
     ]
     if not pairs:
-        names = ", ".join(each.capture.name for each in found)
+        names = ", ".join(each.capture.name for each in captures)
         raise UserError(f"none of {names} is trained on masks of the kind {', '.join(options.masks)}: name another.")
     return pairs

@@ -42,11 +42,11 @@ def write_sheet(path: Path, runs: Sequence[VariantTrial], outcomes: Mapping[str,
     from beags_plugin.runs.read import read_run
 
     own = [run for run in runs if run.seed == runs[0].seed]
-    done = [run for run in own if outcomes[run.trial.digest].failed is None]
-    if not done:
+    finished = [run for run in own if outcomes[run.trial.digest].failed is None]
+    if not finished:
         return False
-    configs = {run.variant.name: outcomes[run.trial.digest].folder / "run" / "config.yml" for run in done}
-    first = EvaluatedRun(configs[done[0].variant.name])
+    configs = {run.variant.name: outcomes[run.trial.digest].folder / "run" / "config.yml" for run in finished}
+    first = EvaluatedRun(configs[finished[0].variant.name])
     scenes = {name: read_run(config) for name, config in configs.items()}
     view, lines = _held_out(first), []
     assert view.image is not None
@@ -56,15 +56,15 @@ def write_sheet(path: Path, runs: Sequence[VariantTrial], outcomes: Mapping[str,
     stands = {class_id: _stand(class_id, first, scenes) for class_id in first.classes if class_id != 0}
     for name, scene in scenes.items():
         render = render_alone(scene.surfels(), view.camera, settings, first.rasterizer, "black")
-        drawn, captions = [(photo, size), (render, size)], [view.name, name]
+        images, captions = [(photo, size), (render, size)], [view.name, name]
         for class_id, (cameras, orbit_settings) in stands.items():
             alone = _alone(scene, class_id)
             for camera in cameras:
                 image = render_alone(alone, camera, orbit_settings, first.rasterizer, "checker")
-                drawn.append((image, (SIDE, SIDE)))
+                images.append((image, (SIDE, SIDE)))
             captions += [first.classes[class_id], *[""] * (AROUND - 1), "from below", *[""] * (BENEATH - 1)]
         texts = captioned(captions, max(size[0] // LETTER, 1))
-        lines.append(beside([cell(image, of, text) for (image, of), text in zip(drawn, texts, strict=True)]))
+        lines.append(beside([cell(image, of, text) for (image, of), text in zip(images, texts, strict=True)]))
     write_picture(path, below(lines))
     return True
 

@@ -43,10 +43,10 @@ def run_captures(options: CapturesOptions) -> list[ResultRow]:
     options. A trial that fails is a row with the reason.
     """
     experiment = _experiment(options)
-    found, lines = find_captures(options)
+    chosen, lines = find_captures(options)
     for line in lines:
         CONSOLE.print(line)
-    captures = _with_masks(experiment, found, options)
+    captures = _with_masks(experiment, chosen, options)
     source = provenance()
     busy = busy_note(int(source["machine"]["cores"]))  # read before the trials, which keep the machine busy
     with open_engine(options) as engine:
@@ -78,14 +78,16 @@ def _experiment(options: CapturesOptions) -> Experiment:
     experiment = adapted(load_experiment(str(file)), wanted)
     for variant in experiment.variants:
         if variant.has_other_masks or variant.per_object:
-            what = "trains each object alone" if variant.per_object else "has masks of its own"
-            raise UserError(f"the rows {file}: {variant.name!r} {what}, which captures do not: take it out.")
+            trait = "trains each object alone" if variant.per_object else "has masks of its own"
+            raise UserError(f"the rows {file}: {variant.name!r} {trait}, which captures do not: take it out.")
     return dataclasses.replace(experiment, name="captures")
 
 
-def _with_masks(experiment: Experiment, found: Sequence[FoundCapture], options: CapturesOptions) -> list[MaskedCapture]:
+def _with_masks(
+    experiment: Experiment, chosen: Sequence[FoundCapture], options: CapturesOptions
+) -> list[MaskedCapture]:
     """Return the captures with each kind of masks; prints a sentence if salient masks cannot be made here."""
-    pairs, code = kinds_of(found, options), code_of_trials()
+    pairs, code = kinds_of(chosen, options), code_of_trials()
     if any(kind == SALIENT for _, kind in pairs):
         reason = made_masks.salient_unavailable(fetch=not options.plan)
         if reason is not None:
@@ -95,12 +97,12 @@ def _with_masks(experiment: Experiment, found: Sequence[FoundCapture], options: 
         raise UserError("no capture is left to train on: the lines above say why.")
     named = (variant for variant in experiment.variants if variant.name == experiment.reference)
     variant = next(named, experiment.variants[0])
-    captures = []
+    masked = []
     for each, kind in pairs:
         base = base_trial(experiment, variant, each.photos, experiment.seeds[0], code)
         scene = made_masks.masked_scene(each, kind, base, options.output)
-        captures.append(MaskedCapture(each, kind, scene, base))
-    return captures
+        masked.append(MaskedCapture(each, kind, scene, base))
+    return masked
 
 
 def _make_masks(captures: Sequence[MaskedCapture], output: Path, engine: Engine, forecast: Forecast) -> dict[str, str]:

@@ -78,8 +78,8 @@ def _table(title: str, rows: Sequence[ResultRow]) -> Table:
     figures = [{**row.figures, COST: psnr_cost(row, rows)} for row in rows]
     columns = [column for column in _COLUMNS if any(each.get(column[1]) is not None for each in figures)]
     lines = []
-    for row, found in zip(rows, figures, strict=True):
+    for row, own in zip(rows, figures, strict=True):
         lacking = f" ({row.count} of {row.count + row.failures} scenes)" if row.failures else ""
-        cells = [number(found.get(name), digits, factor) for _, name, digits, factor in columns]
+        cells = [number(own.get(name), digits, factor) for _, name, digits, factor in columns]
         lines.append([row.variant.name + lacking, *(["failed"] if row.failed else cells)])
     return plain_table(title, ["row", *(head for head, *_ in columns)], lines)

@@ -150,8 +150,8 @@ def _read(scene: TrialScene) -> tuple[Mapping[str, Any], SceneSize]:
     parser = scene.parser()
     parser.downscale_factor = scene.downscale
     with quiet():
-        made = parser.setup()
-        held_out, training = (made.get_dataparser_outputs(split) for split in ("test", "train"))
+        loader = parser.setup()
+        held_out, training = (loader.get_dataparser_outputs(split) for split in ("test", "train"))
     return held_out.metadata, SceneSize.of(training)
 
 
@@ -172,8 +172,8 @@ def _truth_notes(data_set: PaperDataSet, name: str, folder: Path, held_out: Mapp
     if not (any(truth["masks"]) or own) and (lacking := [each for each in wanted if each not in visible]):
         get = f": {data_set.truth.get.format(scene=shlex.quote(str(folder)))}" if data_set.truth.get else ""
         notes.append(f"visible masks of {_listed(lacking)} belong in {folder / data_set.truth.visible}{get}")
-    drawn = {each for each, files in truth["silhouettes"].items() if any(files)}
-    if lacking := [each for each in wanted if each not in drawn]:
+    traced = {each for each, files in truth["silhouettes"].items() if any(files)}
+    if lacking := [each for each in wanted if each not in traced]:
         notes.append(
             f"silhouettes of {_listed(lacking)} belong in {folder / TRUTH / 'silhouettes'}/<object>/<photo>.png "
             "(beags render --underlay): without, extracted objects are compared with visible masks"

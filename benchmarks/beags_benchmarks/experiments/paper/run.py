@@ -72,19 +72,19 @@ def _run(
     busy = busy_note(int(source["machine"]["cores"]))  # read before the trials, which keep the machine busy
     truths = _truths(runs)
     _score_again(runs, truths, trials_folder)
-    found = trained(runs, trials_folder, engine, forecast)
+    trials = trained(runs, trials_folder, engine, forecast)
     for digest, truth in truths.items():
-        if found[digest].result is not None:
-            write_text_atomically(json.dumps({"truth": truth}), found[digest].folder / SCORED_BY)
-    rows = rows_of(runs, found)
-    outcomes = Outcomes(rows, {(run.scene.name, run.variant.name): _truth(run, found) for run in runs})
+        if trials[digest].result is not None:
+            write_text_atomically(json.dumps({"truth": truth}), trials[digest].folder / SCORED_BY)
+    rows = rows_of(runs, trials)
+    outcomes = Outcomes(rows, {(run.scene.name, run.variant.name): _truth(run, trials) for run in runs})
     methods = [variant.name for variant in experiment.variants]
     print_tables(paper_tables(data_sets, methods, outcomes))
     for line in _lines(experiment, options, outcomes):
         CONSOLE.print(line)
     files = {kind: getattr(options, kind) or options.output / f"paper.{kind}" for kind in ("json", "csv")}
     about = {**source, "busy": busy, "quick": options.quick, "downscale": options.downscale}
-    about["processors"] = processors(found)
+    about["processors"] = processors(trials)
     report = {**report_json(experiment, rows, about), "data_sets": _report(data_sets, scenes, methods, outcomes)}
     write_json(files["json"], report)
     write_csv(files["csv"], table_rows(rows))
@@ -97,9 +97,9 @@ def forecast_of(
     scenes: Sequence[SceneOnDisk], runs: Sequence[VariantTrial], folder: Path
 ) -> tuple[Forecast, dict[str, str]]:
     """Return the forecast of the trials in ``folder``, and titles of the scenes by name."""
-    found = {scene.scene.name: scene for scene in scenes if scene.scene is not None}
-    sizes = {name: scene.size for name, scene in found.items()}
-    return Forecast(runs, sizes, folder), {n: f"{scene.data_set.title}, {scene.name}" for n, scene in found.items()}
+    by_name = {scene.scene.name: scene for scene in scenes if scene.scene is not None}
+    sizes = {name: scene.size for name, scene in by_name.items()}
+    return Forecast(runs, sizes, folder), {n: f"{scene.data_set.title}, {scene.name}" for n, scene in by_name.items()}
 
 
 def _methods(options: PaperOptions) -> Experiment:
