@@ -14,9 +14,15 @@ from beags_plugin.data.dataset import Dataset
 from beags_plugin.data.files import image_size, photo_names
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.labels.classes import read_classes
-from beags_plugin.masks.check.areas import Area, contradicted
 from beags_plugin.masks.check.consistency import Agreement
-from beags_plugin.masks.check.contradictions import Contradiction, contradictions, issues_of, settle
+from beags_plugin.masks.check.contradictions import (
+    Area,
+    Contradiction,
+    contradicted,
+    contradictions,
+    issues_of,
+    settle,
+)
 from beags_plugin.masks.check.disagreement import views_against_others
 from beags_plugin.masks.check.files import FEW_VIEWS, MOST_IDS, Coverage, MaskFiles, check_files
 from beags_plugin.masks.check.issues import LEVELS, Issue, ordered, percent
