@@ -9,14 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from beags_plugin.data.dataset import Dataset, MaskKind
+from beags_plugin.data.dataset import Dataset, MaskKind, split_views
 from beags_plugin.data.files import check_mask_files, check_same_size, files_of_views, image_size
 from beags_plugin.data.ground_truth import find_ground_truth, of_views, stray_note
-from beags_plugin.data.labels import read_class_names
 from beags_plugin.data.layout import read_dataset
 from beags_plugin.data.orientation import sideways_photo_error
-from beags_plugin.data.split import split_views
-from beags_plugin.labels.classes import NO_TRUTH
+from beags_plugin.labels.classes import NO_TRUTH, read_class_names
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
 from beags_plugin.views.cameras import SceneCameras, check_cameras, downscaled_size, resize_cameras

@@ -50,7 +50,7 @@ def test_images_of_llff_that_are_narrower_than_the_papers_are_said_to_be(tmp_pat
     write_llff(tmp_path, originals=False)
     monkeypatch.setattr(files, "LARGEST_WIDTH", papers)
     assert camera_from_nerfstudio(parse(tmp_path).cameras, 0).width == WIDTH
-    assert f"The images of images_4 are taken {words} (others: " in " ".join(capsys.readouterr().out.split())
+    assert f"The images of images_4 are used {words} (other sizes: " in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("known_by", ["images", "names", "copies"])

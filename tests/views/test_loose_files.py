@@ -162,7 +162,7 @@ def test_tables_of_llff_in_whole_numbers_and_with_none(tmp_path):
     rows = np.load(table)
     rows[2, 16] = np.nan
     np.save(table, rows)
-    with pytest.raises(UserError, match="poses_bounds.npy hold what is no finite number, such as NaN"):
+    with pytest.raises(UserError, match="poses_bounds.npy hold a value such as NaN that is not finite"):
         parse(tmp_path)
     np.save(table, rows[:, :15].astype(np.float32))
     with pytest.raises(UserError, match=re.escape("poses_bounds.npy are [10, 15] of float32 instead of [views, 17]")):
@@ -187,7 +187,7 @@ def test_missing_photos_between_numbers_that_count_from_anywhere(tmp_path, capsy
         f"1 of the {len(full.image_filenames)} photos" in (said := capsys.readouterr().out) and "IMG_4029.png" in said
     )
     (folder / "IMG_4026.png").unlink()
-    with pytest.raises(UserError, match="keep the images that the poses are of"):
+    with pytest.raises(UserError, match="keep the images that have poses"):
         parse(tmp_path, images_path=folder)
 
 

@@ -14,8 +14,8 @@ from beags_plugin.system.errors import UserError
 class LerfMask(Layout):
     """images, images_train, object_mask/<stem>.png (ids), test_mask/<n>/<prompt>.png and sparse/0.
 
-    By default the images are taken as they are, as in the paper. Test views are those of images/ that images_train/
-    lacks; <n> counts them from 0 in the order of their names.
+    By default images have their own size, as in the paper. Test views are the images that images_train/ lacks; <n>
+    counts them from 0 in the order of their names.
     """
 
     title = "LERF-Mask"
@@ -44,7 +44,7 @@ class LerfMask(Layout):
 
 def _masks_by_prompt(folder: Path, test: list[str]) -> dict[str, dict[str, Path]]:
     """Find the masks of the test views by prompt and stem; raise ``UserError`` for a folder of no test view."""
-    found: dict[str, dict[str, Path]] = {}
+    masks: dict[str, dict[str, Path]] = {}
     for view in sorted(path for path in folder.iterdir() if path.is_dir()):
         if view.name in test:
             stem = view.name
@@ -56,5 +56,5 @@ def _masks_by_prompt(folder: Path, test: list[str]) -> dict[str, dict[str, Path]
                 f"name it 0 to {len(test) - 1}, or like an image."
             )
         for file in sorted(view.glob("*.png")):
-            found.setdefault(file.stem, {})[stem] = file
-    return found
+            masks.setdefault(file.stem, {})[stem] = file
+    return masks

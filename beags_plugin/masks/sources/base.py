@@ -182,7 +182,7 @@ def per_photo(
         progress(index + 1, len(scene.photos))
 
 
-def stacked(objects: Sequence[tuple[int, np.ndarray]], shape: tuple[int, int]) -> np.ndarray:
+def stacked(objects: Sequence[tuple[int, np.ndarray]], shape: tuple[int, ...]) -> np.ndarray:
     """Combine masks [H, W] bool of objects by id into labels [H, W] uint16; smaller objects cover larger ones."""
     labels = np.zeros(shape, np.uint16)
     for class_id, mask in sorted(objects, key=lambda pair: (-int(pair[1].sum()), pair[0])):
