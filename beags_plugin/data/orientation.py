@@ -79,18 +79,18 @@ def turned_note(photos: Sequence[Path]) -> str | None:
 
     These are orientations that keep the photo's size: upside down, mirrored, or square photos on their side.
     """
-    photos_turned = []
+    stored = []
     for photo in photos:
         turned = orientation(photo)
         if turned == 1:
             continue
         size = read_image(photo, lambda image: image.size)
         if turned not in LYING or size[0] == size[1]:
-            photos_turned.append((photo, turned))
-    if not photos_turned:
+            stored.append((photo, turned))
+    if not stored:
         return None
-    photo, turned = photos_turned[0]
+    photo, turned = stored[0]
     return (
-        f"{len(photos_turned)} photos are stored turned, the first of them {photo} with EXIF orientation {turned}: masks "
+        f"{len(stored)} photos are stored turned, the first of them {photo} with EXIF orientation {turned}: masks "
         "must lie as the photos are stored; turn upright ones with beags masks make --upright."
     )

@@ -16,8 +16,8 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.objects.shown import ShownScene
 from beags_plugin.surfaces.frames import Frame, bounding_box
 from beags_plugin.surfaces.item import Photo
+from beags_plugin.views.cameras import small_camera
 from beags_plugin.views.close_ups import fitted
-from beags_plugin.views.small_views import small_camera
 from beags_plugin.views.split_photos import resize_area
 
 _AROUND = 0.1  # A crop shows this share of the object's box beside it too.

@@ -64,7 +64,7 @@ def test_llff_holds_out_the_view_that_nvos_scores(tmp_path, known_by, capsys):
     assert names(outputs) == sorted(["image000", "image008", *target])
     assert set(names(parse(root, images_path=Path("images_4")))) == set(stems) - set(names(outputs))
     said = " ".join(capsys.readouterr().out.split())
-    assert ("holds out IMG_4027, which no image here is called" in said) == (not target)
+    assert ("holds out IMG_4027, but no image has that name" in said) == (not target)
     assert not target or f"({2 + len(target)} held out, {target[0]} by protocol)" in said
 
 

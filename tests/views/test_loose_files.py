@@ -72,7 +72,7 @@ def test_points_of_colmap_without_colours_are_grey(tmp_path):
 def test_points_of_another_format_are_named(tmp_path, name):
     write_transforms(tmp_path, ply_file_path=name)
     (tmp_path / name).write_text("0 0 0\n")
-    with pytest.raises(UserError, match=f"the seed points .*{name} are of a format that is not read: save them as"):
+    with pytest.raises(UserError, match=f"the seed points .*{name} have a format that cannot be read: save them as"):
         parse(tmp_path)
 
 
@@ -152,7 +152,7 @@ def test_rotations_are_normalised_as_colmap_does(tmp_path):
 def test_rotations_of_no_length_are_refused(tmp_path, word):
     write_colmap(tmp_path, text=True)
     rotation(tmp_path, lambda _: word)
-    with pytest.raises(UserError, match=r"images.txt gives v00.png no pose that is a number: export the model again"):
+    with pytest.raises(UserError, match=r"images.txt gives v00.png a pose that is no number: export the model again"):
         parse(tmp_path)
 
 

@@ -75,7 +75,9 @@ def read_cameras(
     count = sum(name.startswith("world_mat_") and not name.startswith("world_mat_inv_") for name in table)
     places, missing = numbered(images, count)
     if len(images) + len(missing) != count:
-        raise UserError(f"{file} has {count} cameras but there are {len(images)} images: keep the images of these cameras.")
+        raise UserError(
+            f"{file} has {count} cameras but there are {len(images)} images: keep the images of these cameras."
+        )
     poses, intrinsics = [], []
     for index in range(count) if places is None else places:
         projection = table.get(f"world_mat_{index}")
