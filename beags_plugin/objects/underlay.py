@@ -1,7 +1,7 @@
-"""``beags render --underlay``: objects alone in held-out views, over the faded photo, to draw their silhouettes on.
+"""``beags render --underlay``: renderings of objects over faded held-out photos, on which to draw silhouettes by hand.
 
-This is how the paper made its truth of objects without what hides them: by hand, over the drawing of an extracted
-object. What is drawn is kept in ground_truth/silhouettes, where evaluation reads it.
+The paper made its ground truth of hidden parts in this way, over renderings of extracted objects. Silhouettes belong in
+ground_truth/silhouettes, where evaluation reads them.
 """
 
 from __future__ import annotations
@@ -23,13 +23,12 @@ from beags_plugin.runs.run import Run
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.whole_files import write_whole
 
-FADED = 0.35  # share of the photo in what lies around the object; the rest is grey
-GREY = 0.5
+FADED, GREY = 0.35, 0.5  # share of the photo around the object, and the grey that it is mixed with
 
 
 @dataclass(frozen=True)
 class Underlays:
-    """The pictures written: <object>/<photo>.png in a folder, and their number. silhouettes: where drawings go."""
+    """The pictures written, <object>/<photo>.png in ``folder``. silhouettes: the folder for the drawn silhouettes."""
 
     folder: Path
     count: int
@@ -46,8 +45,8 @@ def write_underlays(
     """Write a picture of each object in each held-out view, as large as the photo's file and with its lens distortion.
 
     config_path: config.yml of a refined (or assigned) run. objects: names; all but the background if empty. output:
-    the folder; ``renders/underlay`` of the run if None. progress: receives (done, total) pictures. data: if not where
-    they were. Raises ``UserError`` for a mistake, before anything is written.
+    the folder; ``renders/underlay`` of the run if None. progress: receives (done, total) pictures. data: folder of the
+    scene if it has moved. Raises ``UserError`` for a mistake, before anything is written.
     """
     run = Run(config_path, None if open_run(config_path).data_path.exists() else data)
     scene = run.assigned
@@ -83,7 +82,7 @@ def write_underlays(
 
 
 def _folder_of(name: str) -> str:
-    """Return the object's own name, by which evaluation finds its silhouettes; another where no folder can have it."""
+    """Return the object's name, by which evaluation finds silhouettes, or ``file_name`` if no folder can have it."""
     return name if "/" not in name and name not in (".", "..") else file_name(name)
 
 
