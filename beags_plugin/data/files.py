@@ -131,9 +131,9 @@ def image_size(path: Path, what: str = "the image") -> tuple[int, int]:
         raise UserError(f"{what} {path} does not exist: restore it, or remove it from the poses.") from None
 
 
-def _last_bytes(path: Path, count: int = 16) -> bytes:
+def _last_bytes(path: Path) -> bytes:
     with path.open("rb") as file:
-        file.seek(max(0, file.seek(0, os.SEEK_END) - count))
+        file.seek(max(0, file.seek(0, os.SEEK_END) - 16))
         return file.read()
 
 

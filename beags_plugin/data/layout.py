@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
@@ -80,6 +81,19 @@ def fitting_layouts(data: Path) -> list[str]:
     layouts = _all_layouts()
     fitting = {name for name, layout in layouts.items() if layout.recognises(data)}
     return sorted(fitting - {coarser for name in fitting for coarser in layouts[name].refines})
+
+
+def stem_of(folder: Path, stems: Sequence[str], what: str) -> str:
+    """Return the stem of the image that a folder belongs to.
+
+    The folder's name is that stem, or its place in the order of ``stems``, from 0. Raises ``UserError``. what: a word
+    for the images, for errors.
+    """
+    if folder.name in stems:
+        return folder.name
+    if folder.name.isdigit() and int(folder.name) < len(stems):
+        return stems[int(folder.name)]
+    raise UserError(f"{folder} is for no {what}, of which there are {len(stems)}: name it 0, 1, ..., or like one.")
 
 
 def _all_layouts() -> dict[str, Layout]:

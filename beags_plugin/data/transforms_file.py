@@ -27,7 +27,9 @@ def read_transforms(file: Path) -> dict[str, Any]:
     check_numbers(file, "it", meta)
     seen: set[str] = set()
     for index, frame in enumerate(frames):
-        name = _checked_name(file, index, frame)
+        name = frame.get("file_path") if isinstance(frame, dict) else None
+        if not isinstance(name, str) or not name or "\0" in name:
+            raise UserError(f"frame {index + 1} of {file} has no file_path: give it the path of its image.")
         if name in seen:
             raise UserError(f"{file} gives {name} two poses: keep one of its frames.")
         seen.add(name)
@@ -35,13 +37,6 @@ def read_transforms(file: Path) -> dict[str, Any]:
         frame["transform_matrix"] = _checked_matrix(file, name, frame.get("transform_matrix"))
     _check_rest(file, meta)
     return meta
-
-
-def _checked_name(file: Path, index: int, frame: Any) -> str:
-    name = frame.get("file_path") if isinstance(frame, dict) else None
-    if not isinstance(name, str) or not name or "\0" in name:
-        raise UserError(f"frame {index + 1} of {file} has no file_path: give it the path of its image.")
-    return name
 
 
 def _checked_matrix(file: Path, name: str, matrix: Any) -> list[list[float]]:

@@ -28,16 +28,13 @@ Progress = Callable[[int, int], None]
 _PLAIN_NAMES = ("scene", "turned")  # folders of every beags demo
 
 
-def evaluate_run(
-    config_path: Path, protocol: Protocol | None = None, *, name: str = "", progress: Progress | None = None
-) -> RunMetrics:
+def evaluate_run(config_path: Path, protocol: Protocol | None = None) -> RunMetrics:
     """Score a trained run on the held-out views of its data, after refinement and, if it has saved that state, before.
 
-    config_path: config.yml of a run. protocol: definitions of the metrics. name: of the scene in tables; that of the
-    data folder if empty. progress: receives (done, total) views. Raises ``UserError`` for a run, data or a protocol
-    that cannot be used.
+    config_path: config.yml of a run. protocol: definitions of the metrics. Raises ``UserError`` for a run, data or a
+    protocol that cannot be used.
     """
-    return EvaluatedRun(config_path, name).metrics(protocol, progress)
+    return EvaluatedRun(config_path).metrics(protocol)
 
 
 class EvaluatedRun:
@@ -82,7 +79,7 @@ class EvaluatedRun:
         return shown_pixels(first, self.rasterizer, self.settings, held_out, training)
 
     def metrics(self, protocol: Protocol | None = None, progress: Progress | None = None) -> RunMetrics:
-        """Return the figures of all stages; arguments as for ``evaluate_run``."""
+        """Return the figures of all stages. progress: receives (done, total) views."""
         protocol = protocol or Protocol()
         protocol.check()
         shown = self.shown() if self.complete and not self.objects_alone else None

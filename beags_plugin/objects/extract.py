@@ -120,6 +120,18 @@ def objects_with_gaussians(scene: SavedScene, objects: Sequence[str], run: Path)
     return present
 
 
+def chosen_objects(scene: SavedScene, objects: Sequence[str], run: Path) -> dict[str, int]:
+    """Return {name: class id} of ``objects`` in their order; if empty, of all objects that have Gaussians.
+
+    Raises ``UserError`` for an object without Gaussians, and if there is none but the background.
+    """
+    present = objects_with_gaussians(scene, objects, run)
+    chosen = objects or [name for name, class_id in present.items() if class_id != 0]
+    if not chosen:
+        raise UserError(f"{run} holds no object but the background: name another run, or --object background.")
+    return {name: present[name] for name in chosen}
+
+
 def empty_objects(scene: SavedScene, run: Path) -> dict[str, int]:
     """Return {name: class id} of the classes without Gaussians; empty for an extracted run, which holds few objects."""
     if (run / EXTRACTION_FILE).exists():

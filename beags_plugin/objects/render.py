@@ -13,7 +13,7 @@ import torch
 from beags_plugin.core.cameras import Camera, viewmat_from_opengl
 from beags_plugin.core.select import select_class
 from beags_plugin.objects.export import Progress
-from beags_plugin.objects.extract import folder_names, objects_with_gaussians
+from beags_plugin.objects.extract import chosen_objects, folder_names, objects_with_gaussians
 from beags_plugin.pictures.cells import write_picture
 from beags_plugin.pictures.objects import Subject, comparison, film, sheet
 from beags_plugin.pictures.options import PictureFormat, RenderOptions
@@ -54,17 +54,14 @@ def render_run(
         return _along(options.camera_path, config_path, objects, form, output, options, progress)
     run = Run(config_path, data)
     scene = run.assigned
-    present = objects_with_gaussians(scene, objects, config_path.parent)
-    names = list(dict.fromkeys(objects)) or [name for name, class_id in present.items() if class_id != 0]
-    if not names:
-        raise UserError(f"{config_path} holds no object but the background: name it with --object background.")
+    chosen = chosen_objects(scene, objects, config_path.parent)
     if output is None:
-        title = folder_names(scene.classes)[present[names[0]]] if len(names) == 1 else "objects"
+        title = folder_names(scene.classes)[next(iter(chosen.values()))] if len(chosen) == 1 else "objects"
         suffix = ".png" if form != "video" else _film_suffix()
         output = config_path.parent / "renders" / f"{title}_{form}{suffix}"
     moving = _check_output(output, form)
     stages = {"": scene} if form != "before-after" else {"before": _base_of(config_path), "after": scene}
-    subjects = _subjects(run, stages, names, present, form, moving, options)
+    subjects = _subjects(run, stages, chosen, form, moving, options)
     if moving:
         write_film(output, film(subjects, run.rasterizer, options.background, progress), options.fps)
     else:
@@ -135,8 +132,7 @@ def _base_of(config_path: Path) -> SavedScene:
 def _subjects(
     run: Run,
     stages: dict[str, SavedScene],
-    names: Sequence[str],
-    present: dict[str, int],
+    chosen: dict[str, int],
     form: str,
     moving: bool,
     options: RenderOptions,
@@ -150,9 +146,9 @@ def _subjects(
         count = max(1, count // 2)
     size = options.size or (480 if moving else 400 if form == "before-after" else 232)
     subjects = []
-    for name in names:
+    for name, class_id in chosen.items():
         parts = {
-            caption: select_class(scene.surfels(), scene.members, present[name])[0] for caption, scene in stages.items()
+            caption: select_class(scene.surfels(), scene.members, class_id)[0] for caption, scene in stages.items()
         }
         stand = orbit_frame(*bounding_box(list(parts.values())[-1]), photos)
         cameras = orbit(stand, count, size, options.elevation, options.turn)

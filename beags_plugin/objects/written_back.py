@@ -47,9 +47,7 @@ def format_of(path: Path, scene: ImportedScene) -> FileFormat:
     return FileFormat("ply", {}, f"A {kind} cannot be written, so a .ply of 3DGS is.")
 
 
-def write_back(
-    config_path: Path, wanted: FileFormat, folder: Path, stem: str, objects: Sequence[str], data: Path | None = None
-) -> list[Path]:
+def write_back(config_path: Path, wanted: FileFormat, folder: Path, stem: str, objects: Sequence[str]) -> list[Path]:
     """Write the whole scene of a refined run to ``folder``, and each of some objects beside it; return the files.
 
     The scene is called ``stem``.cleaned, an object ``stem``.NAME; both lie in the world of the input poses.
@@ -59,7 +57,7 @@ def write_back(
     with tempfile.TemporaryDirectory() as made:
         exported = export_run(
             config_path, objects, formats=[wanted.exporter], output=Path(made), whole=True,
-            options={wanted.exporter: wanted.options}, data=data,
+            options={wanted.exporter: wanted.options},
         )  # fmt: skip
         for one in exported:
             (file,) = one.files

@@ -66,14 +66,6 @@ class SceneCameras:
         return SceneCameras(**{name: part[index] for name, part in parts.items()})
 
 
-def intrinsics(cameras: AnyCameras, index: int) -> Tensor:
-    """Return K [3, 3] float32 of one camera of a flat batch."""
-    K = torch.eye(3)
-    K[0, 0], K[1, 1] = cameras.fx[index, 0], cameras.fy[index, 0]
-    K[0, 2], K[1, 2] = cameras.cx[index, 0], cameras.cy[index, 0]
-    return K
-
-
 def camera_from_nerfstudio(cameras: AnyCameras, index: int = 0) -> Camera:
     """Return the method's camera for one of many, without lens distortion.
 

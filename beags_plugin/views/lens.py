@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.views.cameras import FISHEYE, camera_from_nerfstudio, intrinsics
+from beags_plugin.views.cameras import FISHEYE, camera_from_nerfstudio
 
 if TYPE_CHECKING:
     from beags_plugin.views.cameras import AnyCameras
@@ -150,7 +150,7 @@ def _straightened(
     image, for OpenCV, whose pixel centres are whole numbers. All have nerfstudio's precision, so that bits agree.
     """
     k1, k2, k3, k4, p1, p2 = distorted.distortion_params[index].numpy()
-    K = intrinsics(distorted, index).numpy()
+    K = camera_from_nerfstudio(distorted, index).K.numpy()
     K[0, 2], K[1, 2] = K[0, 2] - 0.5, K[1, 2] - 0.5
     if int(distorted.camera_type[index]) == FISHEYE:
         lens = np.array([k1, k2, k3, k4])
@@ -201,7 +201,7 @@ def _opencv_lens(cameras: AnyCameras, index: int) -> tuple[bool, np.ndarray]:
 
 def _intrinsics(cameras: AnyCameras, index: int, width: int, height: int) -> np.ndarray:
     """Return K [3, 3] float64 of the view's image at this size, for OpenCV, whose pixel centres are whole numbers."""
-    K = intrinsics(cameras, index).double().numpy()
+    K = camera_from_nerfstudio(cameras, index).K.double().numpy()
     K = np.diag([width / int(cameras.width[index]), height / int(cameras.height[index]), 1.0]) @ K
     K[:2, 2] -= 0.5
     return K
