@@ -98,9 +98,9 @@ def points_of(files: list[Path]) -> Iterator[tuple[float, float]]:
 
     if not files:
         return
-    drawn = np.stack([read_binary_mask(path) for path in files]).any(axis=0)
-    depth = np.asarray(distance_transform_edt(np.pad(drawn, 1)))[1:-1, 1:-1]  # scribbles end at the image's border
-    rows, columns = np.nonzero(drawn & (depth == maximum_filter(depth, 3)))  # the middle line
+    scribbled = np.stack([read_binary_mask(path) for path in files]).any(axis=0)
+    depth = np.asarray(distance_transform_edt(np.pad(scribbled, 1)))[1:-1, 1:-1]  # scribbles end at the image's border
+    rows, columns = np.nonzero(scribbled & (depth == maximum_filter(depth, 3)))  # the middle line
     if not len(rows):
         return
     places = np.stack([columns, rows], axis=1) + 0.5

@@ -12,7 +12,8 @@ from beags_plugin.system.errors import UserError
 
 LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _ALIASES = {"fx": "fl_x", "fy": "fl_y", "width": "w", "height": "h"}
-_FOCAL = {"x": ("fl_x", "camera_angle_x", "x_fov"), "y": ("fl_y", "camera_angle_y", "y_fov")}  # in order of precedence
+# The first entry takes precedence.
+_FOCAL = {"x": ("fl_x", "camera_angle_x", "x_fov"), "y": ("fl_y", "camera_angle_y", "y_fov")}
 _SIZE = ("w", "h")
 _MODELS = {"PERSPECTIVE": "PINHOLE", "FISHEYE": "OPENCV_FISHEYE"}  # other programs' names
 _ANGLES = ("camera_angle_x", "camera_angle_y")  # radians

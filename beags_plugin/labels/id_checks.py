@@ -128,5 +128,5 @@ def check_palettes(masks: Sequence[Path], palettes: Sequence[Mapping[int, tuple[
 
 
 def _listed(ids: Sequence[int]) -> str:
-    shown = ", ".join(map(str, ids[:5]))
-    return f"{shown}, ..." if len(ids) > 5 else shown
+    listed = ", ".join(map(str, ids[:5]))
+    return f"{listed}, ..." if len(ids) > 5 else listed

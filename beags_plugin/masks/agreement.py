@@ -209,13 +209,13 @@ def agreed_masks(
         with torch.no_grad():
             light = draw_features(rasterizer, inputs, features, camera, settings).cpu().numpy()
         of_classes, certain = light[..., :-1], light[..., -1] > DRAWN
-        drawn = np.where(of_classes.max(axis=-1) > DRAWN, of_classes.argmax(axis=-1), IGNORE)
-        given = np.full(drawn.shape, IGNORE, np.int64) if mask is None else mask.cpu().numpy().astype(np.int64)
+        rendered = np.where(of_classes.max(axis=-1) > DRAWN, of_classes.argmax(axis=-1), IGNORE)
+        given = np.full(rendered.shape, IGNORE, np.int64) if mask is None else mask.cpu().numpy().astype(np.int64)
         if mask is None or view in whole:
-            redrawn = np.ones(drawn.shape, dtype=bool)
+            redrawn = np.ones(rendered.shape, dtype=bool)
         else:
-            redrawn = _wide((drawn != IGNORE) & (drawn != given) & (given != IGNORE), reach)
-        labelled = np.where(redrawn, drawn, given).astype(np.uint16)
+            redrawn = _wide((rendered != IGNORE) & (rendered != given) & (given != IGNORE), reach)
+        labelled = np.where(redrawn, rendered, given).astype(np.uint16)
         if photos is not None and redrawn.any():
             near = _grown(redrawn, 2 * reach)
             labelled = np.where(near, snap_to_edges(labelled, photos[view](), 2 * reach), labelled)

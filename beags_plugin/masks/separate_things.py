@@ -67,9 +67,9 @@ def separate(agreement: Agreement, surfels: Surfels, most: int) -> Separation:
     light = np.bincount(parts, agreement.light[mine], minlength=int(parts.max(initial=-1)) + 1)
     order = np.argsort(-light, kind="stable")
     things = order[light[order] >= THING * light.max(initial=0.0)]
-    kept = things[:most]
+    chosen = things[:most]
     of_part = np.full(len(light), -1)
-    of_part[things], of_part[kept] = BACKGROUND, np.arange(1, len(kept) + 1)
+    of_part[things], of_part[chosen] = BACKGROUND, np.arange(1, len(chosen) + 1)
     thing = of_part[parts]
     if (crumbs := thing < 0).any():
         from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
@@ -77,9 +77,9 @@ def separate(agreement: Agreement, surfels: Surfels, most: int) -> Separation:
         thing[crumbs] = thing[~crumbs][cKDTree(centres[~crumbs]).query(centres[crumbs])[1]]
     class_ids, of_more = np.zeros(len(surfels), np.int32), np.zeros(len(surfels), bool)
     class_ids[mine], of_more[mine] = thing, thing == BACKGROUND
-    found = replace(agreement, class_ids=torch.from_numpy(class_ids))
-    counts = Things(most, len(kept), len(things) - len(kept))
-    return Separation(found, counts, torch.from_numpy(of_more))
+    separated = replace(agreement, class_ids=torch.from_numpy(class_ids))
+    counts = Things(most, len(chosen), len(things) - len(chosen))
+    return Separation(separated, counts, torch.from_numpy(of_more))
 
 
 def parts_of(centres: np.ndarray, deviations: np.ndarray) -> np.ndarray:

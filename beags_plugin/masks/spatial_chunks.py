@@ -16,7 +16,7 @@ from beags_plugin.ops.voxel_votes import brick_sample
 
 MOST_BRICKS = 1 << 19  # bricks of 4 x 4 x 4 voxels in memory: about 0.4 GB
 _BRICK = 4
-_PART = 64  # about one brick in 64 is counted
+_PART = 64  # one brick in so many is counted, approximately
 _PRIMES = (73856093, 19349663, 83492791)  # the hash of native/ops/voxel_votes.cpp
 
 

@@ -82,7 +82,7 @@ class EvaluatedRun:
         """Return the figures of all stages. progress: receives (done, total) views."""
         protocol = protocol or Protocol()
         protocol.check()
-        shown = self.shown() if self.complete and not self.objects_alone else None
+        observed = self.shown() if self.complete and not self.objects_alone else None
         figures: dict[Stage, SceneMetrics] = {}
         total = len(self.views) * len(self.stages)
         for stage, scene in self.stages.items():
@@ -99,7 +99,7 @@ class EvaluatedRun:
                 objects_alone=self.objects_alone,
                 colors_fitted=self.colors_fitted,
                 background=self.views.background,
-                shown=shown,
+                shown=observed,
                 progress=None if progress is None else lambda done, _, former=former: progress(former + done, total),
             )
         return RunMetrics(

@@ -49,7 +49,7 @@ class RunGeometry:
         self._of_split: list[tuple[Literal["train", "eval"], int]] = [("train", i) for i in range(len(self.images))]
         held_out = zip(self.manager.eval_dataset.image_filenames, self.manager.views("eval"), strict=True)
         for index, (image, view) in enumerate(held_out):
-            if image not in self.images:  # without held-out views, the training views serve as both
+            if image not in self.images:  # the training views serve as both if none is held out
                 self._of_split.append(("eval", index))
                 self.images.append(image)
                 self.cameras.append(view.camera)

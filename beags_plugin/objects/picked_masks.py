@@ -63,11 +63,11 @@ def save_masks(
     again = _holds_masks(folder)
     make_masks(data, DrawnSource(members, names), config_path, folder, overwrite=again)
     write_text_atomically(_digest(folder), folder / STAMP)
-    said = f"{'Replaced' if again else 'Saved'} {folder / 'masks'} and classes.json; look at {folder / 'made.png'}."
+    sentence = f"{'Replaced' if again else 'Saved'} {folder / 'masks'} and classes.json; look at {folder / 'made.png'}."
     own: dict[str, Any] = {"masks_path": None, "classes_path": Path("classes.json"), "ignore_ids": ()}
     if folder != scene:
         own |= {"masks_path": folder / "masks", "classes_path": folder / "classes.json"}
-    return SavedMasks(said, refinement_command(open_run(config_path, photos), replace(data, **own)))
+    return SavedMasks(sentence, refinement_command(open_run(config_path, photos), replace(data, **own)))
 
 
 def refinement_command(config: RunConfig, parser: DataOptions) -> str:

@@ -139,7 +139,7 @@ def _subjects(
 ) -> list[Subject]:
     try:
         photos = run.viewpoints.cameras
-    except UserError:  # without the data, z of nerfstudio's frame is up
+    except UserError:  # the data are missing; z of nerfstudio's frame is up
         photos = []
     count = options.frames if moving else options.views
     if form == "before-after" and not moving:

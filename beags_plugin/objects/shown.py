@@ -63,8 +63,8 @@ class Shown:
 
     def scene(self) -> tuple[ShownScene | None, str]:
         """Return the scene, or None and why it is not available."""
-        found = self._scene_or_doubt
-        return (None, found) if isinstance(found, str) else (found, "")
+        scene = self._scene_or_doubt
+        return (None, scene) if isinstance(scene, str) else (scene, "")
 
 
 def shown_scene(run: Run) -> ShownScene:

@@ -66,8 +66,8 @@ def write_underlays(
         for number, (name, part) in enumerate(parts.items()):
             with torch.no_grad():
                 inputs = surfel_inputs(part, view.camera)
-                drawn = rasterizer.rasterize(inputs, view.camera, settings, surfels.means.new_zeros(3))
-            picture = drawn.color.cpu() + (1.0 - drawn.alpha.cpu())[..., None] * faded
+                render = rasterizer.rasterize(inputs, view.camera, settings, surfels.means.new_zeros(3))
+            picture = render.color.cpu() + (1.0 - render.alpha.cpu())[..., None] * faded
             straight = (255.0 * picture.clamp(0, 1) + 0.5).to(torch.uint8).numpy()
             as_photo = np.stack(
                 [manager.files["eval"].as_in_file(straight[..., c], index, border=0) for c in range(3)], axis=2

@@ -34,7 +34,7 @@ CONCAVE, CONVEX, STEP, COLOR, DISTANCE = 30.0, 0.5, 30.0, 2.0, 0.2
 PLANE_HEIGHT, PLANE_SLOPE, PLANE_COSINE = 0.5, 0.02, 0.95
 FLOOR = 1e-5  # least weight of a link, so that a noisy normal stops no walk
 SHORTEST, LONGEST = 0.1, 3.0  # bounds of l, so that neither coincident nor isolated Gaussians dominate
-SMOOTHING_ROUNDS, SMOOTHING_POWER = 2, 8  # with this power, neighbours turned by 30 degrees have a third of the weight
+SMOOTHING_ROUNDS, SMOOTHING_POWER = 2, 8  # neighbours turned by 30 degrees have a third of the weight
 
 
 @dataclass(frozen=True)

@@ -104,8 +104,8 @@ class CloseUps:
         if chance.random() >= self.share or not own:
             return None
         close_up = own[chance.randrange(len(own))]
-        kept = close_up.camera.width, close_up.camera.height
-        size = kept if chance.random() < WINDOWS else fitted(*kept, self.pixels)
+        stored = close_up.camera.width, close_up.camera.height
+        size = stored if chance.random() < WINDOWS else fitted(*stored, self.pixels)
         width, height = fitted(*size, self.pixels)
         left, top = chance.randint(0, size[0] - width), chance.randint(0, size[1] - height)
         return close_up.seen(size, (left, top, left + width, top + height))

@@ -22,7 +22,7 @@ from beags_plugin.views.colmap_model import model_files, read_images, rotation_o
 SPLITS = ("train", "val", "test")
 OLD_APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 """The transform that old versions of ns-process-data applied to COLMAP's world without recording it."""
-_COLMAP_APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])  # in nerfstudio, -y is up
+_COLMAP_APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])  # nerfstudio has -y up
 
 
 @dataclass(frozen=True)
@@ -101,15 +101,15 @@ def _of_transforms(poses: TransformsFile, root: Path) -> SourceViews:
 def _of_colmap(poses: ColmapModel, root: Path) -> SourceViews:
     cameras_file, images_file = model_files(poses.folder)
     cameras = colmap_cameras(cameras_file)
-    found = sorted(read_images(images_file), key=lambda image: (poses.images / plain_name(image.name)).as_posix())
-    names = [plain_name(image.name) for image in found]
+    views = sorted(read_images(images_file), key=lambda image: (poses.images / plain_name(image.name)).as_posix())
+    names = [plain_name(image.name) for image in views]
     wanted = [poses.images / name for name in names]
     files = list_images(poses.images)
-    images = PhotoFinder([poses.images], loose_folders=True).find([image.name for image in found])
+    images = PhotoFinder([poses.images], loose_folders=True).find([image.name for image in views])
     if poses.in_order and len(files) == len(names) and not any(images):
         images = list(files)
-    matrices = np.zeros((len(found), 3, 4))
-    for matrix, image in zip(matrices, found, strict=True):
+    matrices = np.zeros((len(views), 3, 4))
+    for matrix, image in zip(matrices, views, strict=True):
         if image.camera not in cameras:
             raise UserError(
                 f"{images_file} gives {image.name} the camera {image.camera}, which {cameras_file} lacks: export the "
@@ -128,7 +128,7 @@ def _of_colmap(poses: ColmapModel, root: Path) -> SourceViews:
         if (root / f"{split}_list.txt").is_file()
     }
     return SourceViews(
-        poses.folder, names, wanted, images, matrices, [cameras[image.camera] for image in found], members or None,
+        poses.folder, names, wanted, images, matrices, [cameras[image.camera] for image in views], members or None,
         applied=_COLMAP_APPLIED,
     )  # fmt: skip
 

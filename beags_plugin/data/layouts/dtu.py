@@ -96,7 +96,7 @@ def read_cameras(
         if not (np.isfinite(K).all() and np.isfinite(center).all()) or abs(K[0, 1]) > LARGEST_SKEW:
             raise UserError(f"world_mat_{index} in {file} is no camera with axes at right angles: correct the file.")
         K[0, 1] = 0.0
-        K[:2, 2] += 0.5  # in the file, pixel centres are whole numbers
+        K[:2, 2] += 0.5  # pixel centres of the file are whole numbers
         intrinsics.append(K)
         poses.append(np.concatenate([rotation.T * [1.0, -1.0, -1.0], center[:, None]], axis=1))
     sizes = np.array([image_size(image) for image in images], np.int64)

@@ -63,12 +63,12 @@ def contradictions(
     only the others, or only the view, give to it.
     """
     wrong, total = missing + extra, missing + extra + right
-    found = [
+    disputed = [
         Contradiction(views[v], ids[k], int(missing[v, k]), int(extra[v, k]), int(total[v, k]), of)
         for v, k in [(int(v), int(k)) for v, k in np.argwhere((wrong >= LEAST) & (wrong >= SHARE[of] * total))]
         if ids[k] != BACKGROUND
     ]
-    return sorted(found, key=lambda one: -one.score)
+    return sorted(disputed, key=lambda one: -one.score)
 
 
 def settle(agreement: Agreement, views: Sequence[str], ids: Sequence[int]) -> list[Contradiction]:
@@ -79,11 +79,11 @@ def settle(agreement: Agreement, views: Sequence[str], ids: Sequence[int]) -> li
     while True:
         right = np.einsum("vcc->vc", agreement.confusion)
         missing, extra = (agreement.confusion.sum(axis) - right for axis in (2, 1))
-        found = contradictions(right, missing, extra, views, ids, "points")
-        scores = {views.index(one.view): one.score for one in reversed(found)}  # worst score of each view
+        disputed = contradictions(right, missing, extra, views, ids, "points")
+        scores = {views.index(one.view): one.score for one in reversed(disputed)}  # worst score of each view
         scores = {view: score for view, score in scores.items() if agreement.voting[view]}
         if not scores:
-            return found
+            return disputed
         agreement.silence([view for view, score in scores.items() if score >= WORST * max(scores.values())])
 
 

@@ -39,8 +39,8 @@ def ordered(issues: Sequence[Issue]) -> list[Issue]:
 
 def named(items: Sequence[object], most: int = 5) -> str:
     """Return the first ``most`` items as a list in words, and the number of the others."""
-    shown = ", ".join(str(item) for item in items[:most])
-    return shown if len(items) <= most else f"{shown} and {len(items) - most} more"
+    listed = ", ".join(str(item) for item in items[:most])
+    return listed if len(items) <= most else f"{listed} and {len(items) - most} more"
 
 
 def percent(part: float, whole: float) -> str:

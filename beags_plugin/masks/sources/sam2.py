@@ -245,10 +245,10 @@ class TextDetector:
             raise UserError(f"the text {text!r} is too long for the detector: name the object in a few words.")
         output, sizes = self.model(**inputs), [(photo.height, photo.width)]
         if grounding:
-            found = self.processor.post_process_grounded_object_detection(
+            result = self.processor.post_process_grounded_object_detection(
                 output, inputs["input_ids"], threshold=threshold, target_sizes=sizes
             )[0]
         else:
-            found = self.processor.post_process_object_detection(output, threshold=threshold, target_sizes=sizes)[0]
-        boxes = [tuple(float(value) for value in box) for box in found["boxes"]]
-        return [(box, float(score)) for box, score in zip(boxes, found["scores"], strict=True)]  # type: ignore[misc]
+            result = self.processor.post_process_object_detection(output, threshold=threshold, target_sizes=sizes)[0]
+        boxes = [tuple(float(value) for value in box) for box in result["boxes"]]
+        return [(box, float(score)) for box, score in zip(boxes, result["scores"], strict=True)]  # type: ignore[misc]

@@ -109,7 +109,7 @@ class _Tracked:
         self.one, self.memory, self.detector, self.best = one, memory, detector, best
         self.threshold, self.strict = threshold, strict
         self.seen = np.zeros(frames, bool)
-        self.detections: dict[int, list[tuple[Box, float]]] = {}  # by frame; the detector runs once on each
+        self.detections: dict[int, list[tuple[Box, float]]] = {}  # detections by frame; the detector runs once on each
         self.score = 0.0  # score of the detection at which tracking started
 
     def first_stage(self, prompts: Mapping[int, Sequence[Prompt]]) -> Iterator[int]:
