@@ -56,7 +56,9 @@ def reproject_pairwise(
 
     Yields the views in order. Raises ``UserError`` for a mask of the wrong size or with ids out of range.
     """
-    check_views(depths, cameras, labels, num_classes, tau)
+    check_counts(depths, cameras, labels, tau)
+    for index, (depth, camera, mask) in enumerate(zip(depths, cameras, labels, strict=True)):
+        check_view(index, depth, camera, mask, num_classes)
     if not cameras:
         return
     depths = list(depths)  # kept in memory, as every view is projected into every other
@@ -102,15 +104,8 @@ def _by_torch(depths, cameras, labels, num_classes: int, tau: float, i: int, map
     return _decide(votes, labels[i], camera)
 
 
-def check_views(depths, cameras, labels, num_classes: int, tau: float) -> None:
-    """Raise ``UserError`` for masks of the wrong size or with ids out of range, ``ValueError`` for other misfits."""
-    check_counts(depths, cameras, labels, tau)
-    for index, (depth, camera, mask) in enumerate(zip(depths, cameras, labels, strict=True)):
-        check_view(index, depth, camera, mask, num_classes)
-
-
 def check_counts(depths, cameras, labels, tau: float) -> None:
-    """Raise for unequal numbers of views or a negative tau."""
+    """Raise ``ValueError`` for unequal numbers of views, ``UserError`` for a negative tau."""
     if not len(depths) == len(cameras) == len(labels):
         raise ValueError(f"{len(depths)} depths, {len(cameras)} cameras and {len(labels)} masks do not belong together")
     if not tau >= 0:
@@ -118,7 +113,7 @@ def check_counts(depths, cameras, labels, tau: float) -> None:
 
 
 def check_view(index: int, depth: Tensor, camera: Camera, mask: Tensor | None, num_classes: int) -> None:
-    """Raise for one view as ``check_views`` does."""
+    """Raise ``UserError`` for a mask of the wrong size or with ids out of range, ``ValueError`` for such a depth."""
     size = (camera.height, camera.width)
     if tuple(depth.shape) != size:
         raise ValueError(f"depth {index} must be {list(size)}, not {list(depth.shape)}")

@@ -174,7 +174,7 @@ def _known(depth: Tensor, mask: Tensor | None) -> Tensor:
 
 
 def _survey(depths, cameras, labels, num_classes: int) -> tuple[float, bool]:
-    """Return the size of the voxels, and whether all depths share type and device; raise as ``check_views``.
+    """Return the size of the voxels, and whether all depths share type and device; raise as ``check_view``.
 
     The size, world units, is ``VOXEL_PIXELS`` times the median of depth / focal length over the objects' pixels, or
     over all rendered pixels if there are no objects: the background may be far away.
