@@ -39,7 +39,7 @@ def test_llff_makes_the_largest_images_as_wide_as_papers_do(tmp_path, monkeypatc
     largest = max(image_size(path)[0] for path in root.rglob("*.*") if path.suffix.lower() in files.IMAGE_SUFFIXES)
     camera = camera_from_nerfstudio(parse(root).cameras, 0)
     assert camera.width == WIDTH - 4 < largest
-    assert f"are taken {WIDTH - 4} pixels wide, as in the paper (" in " ".join(capsys.readouterr().out.split())
+    assert f"are used {WIDTH - 4} pixels wide, as in the paper (" in " ".join(capsys.readouterr().out.split())
     assert camera_from_nerfstudio(parse(root, downscale_factor=1.0).cameras, 0).width == largest
     assert "in the paper" not in capsys.readouterr().out  # that is another size
 
