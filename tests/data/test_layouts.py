@@ -65,7 +65,7 @@ def test_a_size_that_the_user_chose_has_no_note_on_the_papers(tmp_path, layout, 
     folder = {"mipnerf360": "images_4"}.get(layout, "images")
     for options in ({"downscale_factor": 2.0}, {"images_path": Path(folder)}):
         parse(tmp_path, layout=layout, **options)
-        assert "are taken" not in capsys.readouterr().out
+        assert "are used" not in capsys.readouterr().out
 
 
 def test_mipnerf360_masks_and_ground_truth_of_both_kinds(tmp_path):
