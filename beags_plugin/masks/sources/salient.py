@@ -83,10 +83,10 @@ def load(path: Path) -> Callable[[np.ndarray], np.ndarray]:
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # errors of onnxruntime have no class in common
         raise UserError(f"{path} is no ONNX model that onnxruntime can load: name another or fetch it anew.") from error
-    given, found = session.get_inputs(), session.get_outputs()
-    shape, result = given[0].shape, found[0].shape
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    shape, result = inputs[0].shape, outputs[0].shape
     fits = len(shape) == 4 and shape[1] == 3 and result[1:2] == [1]
-    if len(given) != 1 or given[0].type != "tensor(float)" or not fits:
+    if len(inputs) != 1 or inputs[0].type != "tensor(float)" or not fits:
         raise UserError(
             f"{path} is another kind of network than U2-Net (input {shape}, output {result}): name one from "
             "[1, 3, N, N] to [1, 1, N, N]."
@@ -97,7 +97,7 @@ def load(path: Path) -> Callable[[np.ndarray], np.ndarray]:
         small = cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
         colours = (small / max(small.max(), 1) - _MEAN) / _SPREAD
         image = colours.astype(np.float32).transpose(2, 0, 1)[None]
-        best = np.asarray(session.run([found[0].name], {given[0].name: image})[0])[0, 0]
+        best = np.asarray(session.run([outputs[0].name], {inputs[0].name: image})[0])[0, 0]
         return cv2.resize(best, (photo.shape[1], photo.shape[0]), interpolation=cv2.INTER_LINEAR)
 
     return saliency
