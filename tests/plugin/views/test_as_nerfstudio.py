@@ -81,7 +81,7 @@ def test_colmap_cameras_are_alike(tmp_path):
         try:
             entries = parse_colmap_camera_params(SimpleNamespace(**camera._asdict()))
         except NotImplementedError:
-            with pytest.raises(Exception, match=f"lens {camera.model}, which is not known"):
+            with pytest.raises(Exception, match=f"lens {camera.model}, which is not supported"):
                 colmap_cameras(one)
             continue
         found = colmap_cameras(one)[index]
