@@ -1,14 +1,16 @@
-"""A data set as its layout reads it: the files, and the protocol of its evaluation."""
+"""A data set as its layout reads it: its files, and which of its views are held out."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+
+from beags_plugin.system.errors import UserError, meant
 
 MaskKind = Literal["ids", "binary"]
 """Images of class ids, or binary masks of one object (``labels.classes.read_object_mask``)."""
@@ -18,8 +20,8 @@ MaskKind = Literal["ids", "binary"]
 class ColmapModel:
     """Poses in a COLMAP model, binary or text.
 
-    folder: of the model. images: folder of the images that it names. in_order: if no file has a name of the model,
-    files and names are paired in the order of names.
+    folder: of the model. images: folder of the images that it names. in_order: whether files and names may be paired in
+    the order of names if no file has a name of the model.
     """
 
     folder: Path
@@ -29,7 +31,7 @@ class ColmapModel:
 
 @dataclass(frozen=True)
 class TransformsFile:
-    """Poses in nerfstudio's transforms.json; ``images``, unless None, replaces the folder of its file_path."""
+    """Poses in nerfstudio's transforms.json. images: folder that replaces that of its file_path, or None."""
 
     file: Path
     images: Path | None = None
@@ -44,7 +46,7 @@ class PoseTable:
     K: [V, 3, 3] float64, pixels of ``sizes``. sizes: [V, 2] integer width and height; the files may be smaller copies.
     bounds: [V, 2] float64, nearest and farthest depth, world units, or None.
     lens: COLMAP's cameras.bin or cameras.txt with one camera, for its lens distortion, or None.
-    missing: where the photos of other poses of the file should lie, which are left out of these.
+    missing: paths of photos that have a pose in the file but do not exist; their poses are left out.
     """
 
     file: Path
@@ -64,8 +66,8 @@ Poses = ColmapModel | TransformsFile | PoseTable
 class Split:
     """Protocol of the held-out views.
 
-    held_out: stems of images that the protocol names. every: also hold out each ``eval_interval``-th view in the order
-    of names. left_out: stems of images for neither training nor evaluation.
+    held_out: stems of images that the protocol names. every: whether every ``eval_interval``-th view in the order of
+    names is held out too. left_out: stems of images for neither training nor evaluation.
     """
 
     held_out: tuple[str, ...] = ()
@@ -74,7 +76,7 @@ class Split:
 
 
 FilesOfObject = Mapping[str, Path]
-"""Stem of an image to the binary mask of one object in it."""
+"""Stem of an image, to the binary mask of one object in it."""
 
 
 @dataclass(frozen=True)
@@ -83,12 +85,12 @@ class Dataset:
 
     layout: title of the layout. root: folder of the data set.
     masks, mask_kind: folder of the training masks <stem>.png, which may be missing, and their kind.
-    mask_files: stem of an image to its mask, if masks have other names; or None.
-    class_names: id to name, or None; class_names_file: their file, for messages.
-    visible, silhouettes: object name to exact masks for evaluation: of its visible part, and occlusion-free.
-    seed_points: .ply, or COLMAP's points3D.bin or .txt, in the frame of a ``PoseTable``; None: the poses bring them.
-    downscale: factor by which the images' sides are divided by default, for the size that the data set's papers use.
-    notes: sentences for the user. size_note: a sentence about the size of the images, where the layout chose it.
+    mask_files: stem of an image to its mask if masks have other names, or None.
+    class_names: id to name, or None. class_names_file: their file, for messages.
+    visible, silhouettes: object name to exact masks for evaluation, of the visible part and of the whole object.
+    seed_points: .ply, or COLMAP's points3D.bin or .txt, in the frame of a ``PoseTable``; None if the poses bring them.
+    downscale: factor by which the images' sides are divided by default, to the size that the data set's papers use.
+    notes: sentences for the user. size_note: a sentence on the size of the images if the layout chose it, or "".
     """
 
     layout: str
@@ -106,3 +108,27 @@ class Dataset:
     downscale: float = 1.0
     notes: tuple[str, ...] = ()
     size_note: str = ""
+
+
+def split_views(
+    names: Sequence[set[str]], split: Split, interval: int, held_out: Sequence[str] = ()
+) -> tuple[list[int], list[int]]:
+    """Return the indices of the training and of the evaluation views; without held-out views, all serve as both.
+
+    names: for each view, in the order of names, its names: that of its file and that in the poses. interval: of
+    ``Split.every``, counted from the first view that is not left out; 0 for none. held_out: names from the user, in
+    addition to the protocol's. Raises ``UserError`` if a name of ``held_out`` does not exist, or no training view is
+    left.
+    """
+    known = set().union(*names)
+    if unknown := sorted(set(held_out) - known):
+        near = meant(unknown[0], known)
+        raise UserError(f"held_out names {unknown[0]!r}, but no image has that stem{near}: correct the name.")
+    used = [index for index, own in enumerate(names) if own.isdisjoint(split.left_out)]
+    out = set(used[::interval]) if split.every and interval > 0 else set()
+    out |= {index for index in used if not names[index].isdisjoint(split.held_out)}
+    out |= {index for index, own in enumerate(names) if not own.isdisjoint(held_out)}  # also views left out
+    train = [index for index in used if index not in out]
+    if not train:
+        raise UserError(f"all {len(used)} views are held out for evaluation: add views or change eval_interval.")
+    return train, sorted(out) or train

@@ -1,4 +1,4 @@
-"""Masks of LLFF's scenes that are downloaded apart from the photos: NVOS and SPIn-NeRF."""
+"""Masks of LLFF's scenes that are downloaded separately from the photos: NVOS and SPIn-NeRF."""
 
 from __future__ import annotations
 
@@ -12,15 +12,18 @@ from beags_plugin.data.files import image_size, list_images
 from beags_plugin.labels.classes import read_binary_mask
 from beags_plugin.system.errors import UserError
 
-POINTS = 10  # of each kind that stand for the scribbles on an object, as many as one would click
+POINTS = 10  # most points of each kind that replace the scribbles on an object, about as many as a user clicks
 _MASK = "_mask"
-_NO_MASKS = ("_pseudo", "_cutout")  # beside SPIn-NeRF's masks lie pictures under these names
+_NO_MASKS = ("_pseudo", "_cutout")  # endings of other pictures among SPIn-NeRF's masks
 
 
 @dataclass(frozen=True)
 class Scribbles:
-    """Scribbles on an object in one view, as points. view: stem of the camera's file. size: (width, height) that the
-    points are pixels of. inside, outside: (x, y), on the object and beside it."""
+    """Scribbles on an object in one view, as points.
+
+    view: stem of the camera's file. size: (width, height) of the image that the points refer to. inside, outside:
+    (x, y), pixels, on the object and beside it.
+    """
 
     view: str
     size: tuple[int, int]
@@ -30,7 +33,7 @@ class Scribbles:
 
 @dataclass(frozen=True)
 class DownloadedObject:
-    """An object with its visible masks, by the stem of the camera's file, and its scribbles if they are there."""
+    """An object with its visible masks by the stem of the camera's file, and its scribbles if there are any."""
 
     name: str
     masks: dict[str, Path]
@@ -41,8 +44,8 @@ def read_nvos(folder: Path, scene: str) -> list[DownloadedObject]:
     """Read NVOS's objects of a scene of LLFF.
 
     folder: holds masks/<object>/<photo>_mask.png, scribbles/<object>/pos_*.png and neg_*.png (of any size in the
-    photo's proportions), and reference_image/<object>/<photo>, the photo that these are on. Objects are called as the
-    scene, or as the scene and more (horns_left). Raises ``UserError`` without masks, and for a part of the scribbles.
+    photo's proportions), and reference_image/<object>/<photo>, the photo with the scribbles. An object's name is that
+    of the scene, perhaps with an ending (horns_left). Raises ``UserError`` without masks, and for incomplete scribbles.
     """
     masks = folder / "masks"
     if not masks.is_dir():
@@ -51,19 +54,19 @@ def read_nvos(folder: Path, scene: str) -> list[DownloadedObject]:
     own = [name for name in names if name == scene or name.startswith(f"{scene}_")]
     if not own:
         raise UserError(f"{masks} has no object of a scene {scene!r}: name one of {', '.join(names)} with --scene.")
-    found = []
+    objects = []
     for name in own:
         files = {path.stem.removesuffix(_MASK): path for path in sorted((masks / name).glob(f"*{_MASK}.png"))}
         if not files:
             raise UserError(f"{masks / name} holds no mask <photo>{_MASK}.png: restore the download.")
-        found.append(DownloadedObject(name, files, _scribbles(folder, name)))
-    return found
+        objects.append(DownloadedObject(name, files, _scribbles(folder, name)))
+    return objects
 
 
 def read_spin_nerf(folder: Path, scene: str, name: str) -> list[DownloadedObject]:
-    """Read SPIn-NeRF's masks of a scene as those of the object ``name``.
+    """Read SPIn-NeRF's masks of a scene, as masks of the object ``name``.
 
-    folder: holds <scene>/<photo>.png, or is that folder. Raises ``UserError`` without masks.
+    folder: holds <scene>/<photo>.png, or is <scene> itself. Raises ``UserError`` without masks.
     """
     own = folder / scene if (folder / scene).is_dir() else folder
     files = {path.stem: path for path in sorted(own.glob("*.png")) if not path.stem.endswith(_NO_MASKS)}
@@ -87,24 +90,24 @@ def _scribbles(folder: Path, name: str) -> Scribbles | None:
 
 
 def points_of(files: list[Path]) -> Iterator[tuple[float, float]]:
-    """Yield at most ``POINTS`` points (x, y) along the middle of scribbles, each far from those before it.
+    """Yield at most ``POINTS`` points (x, y) along the middle of scribbles, each as far as possible from the others.
 
-    Points are pixels, with the corner of the image as origin. The first is where the scribbles are broadest.
+    Points are in pixels from the corner of the image. The first is where the scribbles are broadest.
     """
     from scipy.ndimage import distance_transform_edt, maximum_filter
 
     if not files:
         return
-    drawn = np.stack([read_binary_mask(path) for path in files]).any(axis=0)
-    depth = np.asarray(distance_transform_edt(np.pad(drawn, 1)))[1:-1, 1:-1]  # the image ends at its border
-    rows, columns = np.nonzero(drawn & (depth == maximum_filter(depth, 3)))  # the middle line
+    scribbled = np.stack([read_binary_mask(path) for path in files]).any(axis=0)
+    depth = np.asarray(distance_transform_edt(np.pad(scribbled, 1)))[1:-1, 1:-1]  # scribbles end at the image's border
+    rows, columns = np.nonzero(scribbled & (depth == maximum_filter(depth, 3)))  # the middle line
     if not len(rows):
         return
     places = np.stack([columns, rows], axis=1) + 0.5
-    left = np.full(len(places), np.inf)
+    distance = np.full(len(places), np.inf)  # squared, to the points so far
     chosen = int(np.argmax(depth[rows, columns]))
     for _ in range(min(POINTS, len(places))):
         x, y = places[chosen]
         yield float(x), float(y)
-        left = np.minimum(left, ((places - places[chosen]) ** 2).sum(axis=1))
-        chosen = int(np.argmax(left))
+        distance = np.minimum(distance, ((places - places[chosen]) ** 2).sum(axis=1))
+        chosen = int(np.argmax(distance))

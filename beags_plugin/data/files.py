@@ -1,4 +1,4 @@
-"""Images and masks of a data set on disk, and cheap checks that they fit together."""
+"""Images and masks of a data set on disk, and quick checks that they fit together."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ LARGEST_WIDTH = 1600  # pixels
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Return the images directly in a folder, sorted by name; none if the folder does not exist."""
+    """Return the images directly in a folder, sorted by name; empty if the folder does not exist."""
     if not folder.is_dir():
         return []
     files = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
-    files = (path for path in files if not path.name.startswith("."))  # what macOS writes beside files of other disks
+    files = (path for path in files if not path.name.startswith("."))  # macOS writes such files on other disks
     return sorted(files, key=lambda path: path.name)
 
 
 OWN_PICTURES = ("made.png", "contradicted.png", "poses.png", "contact_sheet.png")
-"""What commands of this package draw into a scene's folder: no photos."""
+"""Pictures that commands of this package write into a scene's folder, and that are no photos."""
 
 
 def list_photos(data: Path) -> list[Path]:
-    """Return the photos in the folder ``images`` of ``data``, or without one directly in ``data``, sorted by name."""
+    """Return the photos of a folder, in ``folder_of_photos``, sorted by name."""
     return [path for path in list_images(folder_of_photos(data)) if path.name not in OWN_PICTURES]
 
 
 def folder_of_photos(data: Path) -> Path:
-    """Return the folder ``images`` in ``data``, unless there is none, or it holds no images and ``data`` does."""
+    """Return the folder ``images`` in ``data`` if it holds images or ``data`` itself holds none; else ``data``."""
     images = data / "images"
     return images if images.is_dir() and (list_images(images) or not list_images(data)) else data
 
@@ -55,7 +55,7 @@ def image_folders(root: Path) -> list[Path]:
 
 
 def choose_images(root: Path, chosen: Path | None = None) -> Path:
-    """Return ``chosen``, else the folder of the largest copies that are at most 1600 pixels on a side.
+    """Return ``chosen``, else the folder of the largest copies with at most ``LARGEST_WIDTH`` pixels on a side.
 
     Raises ``UserError`` if there is no image.
     """
@@ -69,7 +69,7 @@ def choose_images(root: Path, chosen: Path | None = None) -> Path:
 
 
 def largest_images(root: Path, chosen: Path | None = None) -> tuple[Path, float]:
-    """Return ``chosen`` and 1, else the folder of the largest copies and the factor that makes them 1600 pixels wide.
+    """Return ``chosen`` and 1, else the folder of the largest copies and the factor to ``LARGEST_WIDTH``.
 
     Raises ``UserError`` if there is no image.
     """
@@ -80,41 +80,36 @@ def largest_images(root: Path, chosen: Path | None = None) -> tuple[Path, float]
 
 
 def size_note(folder: Path, size: str = "as they are, as in the paper") -> str:
-    """Return a sentence about the size of images that a layout has chosen, which ``size`` compares with the paper's."""
-    others = "others: beags-data --images-path FOLDER or --downscale-factor N"
-    return f"The images of {folder.name} are taken {size} ({others})."
+    """Return a sentence on the size of the images that a layout has chosen. size: compared with the paper's."""
+    others = "other sizes: beags-data --images-path FOLDER or --downscale-factor N"
+    return f"The images of {folder.name} are used {size} ({others})."
 
 
 def width_note(folder: Path) -> str:
-    """Return that sentence for the images of ``largest_images``: smaller files than the paper's are not enlarged."""
+    """Return ``size_note`` for the images of ``largest_images``, which are never enlarged."""
     width = image_width(folder)
     if width < LARGEST_WIDTH:
         return size_note(folder, f"as they are, {width} pixels wide, narrower than the paper's {LARGEST_WIDTH}")
     return size_note(folder, f"{LARGEST_WIDTH} pixels wide, as in the paper")
 
 
-def numbered(files: Sequence[Path], count: int) -> list[int] | None:
-    """Return which of ``count`` photos these are where some are missing, by the numbers that end their names.
+def numbered(files: Sequence[Path], count: int) -> tuple[list[int] | None, tuple[Path, ...]]:
+    """Return which of ``count`` photos ``files`` are if some are missing, and the paths of the missing ones.
 
-    The numbers count from 0, or the first and the last photo are there. None where nobody can tell which are missing.
+    The numbers at the ends of their names tell: these count from 0, or the first and the last photo are there. None and
+    () if none are missing, or the numbers do not tell which.
     """
-    ends = [re.search(r"\d+$", file.stem) for file in files]
-    places = [int(end[0]) for end in ends if end is not None]
-    if not len(set(places)) == len(files) < count:
-        return None
-    if all(place < count for place in places):
-        return places
-    first = min(places)
-    return [place - first for place in places] if max(places) - first == count - 1 else None
-
-
-def missing_numbers(files: Sequence[Path], places: Sequence[int], count: int) -> tuple[Path, ...]:
-    """Return the photos of ``count`` that are missing beside ``files``, whose ``places`` are those of ``numbered``."""
-    first = files[0]
-    number = re.search(r"\d+$", first.stem)[0]  # type: ignore[index]
-    start, shift = first.stem[: -len(number)], int(number) - places[0]
-    absent = sorted(set(range(count)) - set(places))
-    return tuple(first.with_name(f"{start}{index + shift:0{len(number)}d}{first.suffix}") for index in absent)
+    numbers = [end[0] for file in files if (end := re.search(r"\d+$", file.stem)) is not None]
+    places = [int(number) for number in numbers]
+    if not 0 < len(set(places)) == len(files) < count:
+        return None, ()
+    shift = 0
+    if max(places) >= count and max(places) - (shift := min(places)) != count - 1:
+        return None, ()
+    places = [place - shift for place in places]
+    first, digits = files[0], len(numbers[0])
+    start, absent = first.stem[:-digits], sorted(set(range(count)) - set(places))
+    return places, tuple(first.with_name(f"{start}{index + shift:0{digits}d}{first.suffix}") for index in absent)
 
 
 def image_width(folder: Path) -> int:
@@ -127,7 +122,7 @@ def image_size(path: Path, what: str = "the image") -> tuple[int, int]:
 
     def read(image: Image) -> tuple[int, int]:
         if (end := _ENDS.get(image.format or "")) is not None and end not in _last_bytes(path):
-            image.load()  # refuses it, unless there is only more behind its end, as behind phones' moving photos
+            image.load()  # raises, unless only other data follow the image's end, as in phones' moving photos
         return image.size
 
     try:
@@ -136,16 +131,16 @@ def image_size(path: Path, what: str = "the image") -> tuple[int, int]:
         raise UserError(f"{what} {path} does not exist: restore it, or remove it from the poses.") from None
 
 
-def _last_bytes(path: Path, count: int = 16) -> bytes:
+def _last_bytes(path: Path) -> bytes:
     with path.open("rb") as file:
-        file.seek(max(0, file.seek(0, os.SEEK_END) - count))
+        file.seek(max(0, file.seek(0, os.SEEK_END) - 16))
         return file.read()
 
 
 def photo_names(images: Sequence[Path]) -> list[str]:
-    """Return each image's path below their common folder, without suffix: "v1", or "left/v1".
+    """Return each image's path below their common folder, without suffix, such as "v1" or "left/v1".
 
-    Raises ``UserError`` if two images share a name, since masks are found by it.
+    Raises ``UserError`` if two images share a name, as masks are found by it.
     """
     if not images:
         return []
@@ -165,10 +160,10 @@ def photo_names(images: Sequence[Path]) -> list[str]:
 
 
 def files_of_views(folder: Path, images: Sequence[Path], images_root: Path) -> list[Path | None]:
-    """Find each image's .png in ``folder``, by its path below ``images_root``, else by its stem; None without.
+    """Find each image's .png in ``folder`` by its path below ``images_root``, else by its stem; None without one.
 
-    COLMAP's way, by the image's name with its suffix (v1.jpg.png), is found too. Raises ``UserError`` if several images
-    share the stem of a file.
+    Names with the image's suffix, as COLMAP writes them (v1.jpg.png), are found too. Raises ``UserError`` if several
+    images share the stem of a file.
     """
     if not folder.is_dir():
         return [None] * len(images)
@@ -182,18 +177,18 @@ def files_of_views(folder: Path, images: Sequence[Path], images_root: Path) -> l
     for image in images:
         below = image.relative_to(images_root) if image.is_relative_to(images_root) else Path(image.name)
         own = (present.get(name) for name in (below.with_suffix("").as_posix(), below.as_posix()))
-        found = next((path for path in own if path is not None), None)
-        if found is None and (found := present.get(image.stem) or present.get(image.name)) and stems[image.stem] > 1:
+        file = next((path for path in own if path is not None), None)
+        if file is None and (file := present.get(image.stem) or present.get(image.name)) and stems[image.stem] > 1:
             raise UserError(
-                f"{found} could belong to {stems[image.stem]} images called {image.stem}: "
+                f"{file} could belong to {stems[image.stem]} images called {image.stem}: "
                 f"put it at the image's own path below {folder}."
             )
-        files.append(found)
+        files.append(file)
     return files
 
 
 def unposed_note(posed: Sequence[Path]) -> str | None:
-    """Return a sentence about photos beside the posed ones that have no pose; None where all have one."""
+    """Return a sentence on photos in the folders of the posed ones that have no pose; None if all have one."""
     known = {path.with_suffix("") for path in posed}
     folders = sorted({path.parent for path in posed})
     photos = [path for folder in folders for path in list_images(folder) if path.name not in OWN_PICTURES]
@@ -206,7 +201,7 @@ def unposed_note(posed: Sequence[Path]) -> str | None:
 
 
 def check_mask_files(folder: Path, images: Sequence[Path]) -> None:
-    """Raise ``UserError`` for a folder in which there are masks, but none that belongs to an image."""
+    """Raise ``UserError`` for a folder that holds masks, none of which belongs to an image."""
     files = sorted(path for path in folder.rglob("*") if not path.name.startswith(".") and path.is_file())
     pictures = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
     stems = {image.stem for image in images}
@@ -225,7 +220,7 @@ def check_mask_files(folder: Path, images: Sequence[Path]) -> None:
 
 
 def same_proportions(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Return whether two images (width, height) may be copies of one: a smaller copy rounds each side by a pixel."""
+    """Return whether two sizes (width, height) may be of copies of one image, whose sides are rounded to pixels."""
     (width, height), (other_width, other_height) = size, other
     expected = other_width * height / width
     return abs(expected - other_height) <= 1.0 + expected / other_width
@@ -236,7 +231,7 @@ def check_same_size(
 ) -> None:
     """Raise ``UserError`` for the first mask that differs in size from its image (width, height).
 
-    images: the files, whose EXIF may say that they are stored on their side.
+    images: the images' files, which may be stored on their side, or None.
     """
     for index, (mask, (width, height)) in enumerate(zip(masks, sizes, strict=True)):
         if mask is not None and (found := image_size(mask, "the mask")) != (width, height):

@@ -1,4 +1,4 @@
-"""Cameras of transforms.json in the dialects of instant-ngp, Blender, nerfstudio and their like."""
+"""Cameras of transforms.json in the dialects of instant-ngp, Blender, nerfstudio and similar programs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from beags_plugin.system.errors import UserError
 
 LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _ALIASES = {"fx": "fl_x", "fy": "fl_y", "width": "w", "height": "h"}
-_FOCAL = {"x": ("fl_x", "camera_angle_x", "x_fov"), "y": ("fl_y", "camera_angle_y", "y_fov")}  # the first one counts
+# The first entry takes precedence.
+_FOCAL = {"x": ("fl_x", "camera_angle_x", "x_fov"), "y": ("fl_y", "camera_angle_y", "y_fov")}
 _SIZE = ("w", "h")
 _MODELS = {"PERSPECTIVE": "PINHOLE", "FISHEYE": "OPENCV_FISHEYE"}  # other programs' names
 _ANGLES = ("camera_angle_x", "camera_angle_y")  # radians
@@ -23,7 +24,7 @@ NUMBERS = ("fl_x", "fl_y", *_ANGLES, *_DEGREES, *_SIZE, "cx", "cy", *LENS)
 
 @dataclass(frozen=True)
 class FrameCamera:
-    """A camera in pixels of its ``width`` x ``height``; lens: k1, k2, k3, k4, p1, p2; model: nerfstudio's name."""
+    """A camera in pixels of its ``width`` x ``height``. lens: k1, k2, k3, k4, p1, p2. model: nerfstudio's name."""
 
     fx: float
     fy: float
@@ -38,7 +39,7 @@ class FrameCamera:
 def check_numbers(file: Path, whose: str, entries: dict[str, Any]) -> None:
     """Raise ``UserError`` for the first entry of a camera that is no usable number.
 
-    In place, numbers that are written as text become numbers, null goes, and other usual names become ours.
+    It changes the entries in place: text becomes numbers, null is removed, and other usual names become ours.
     """
     for alias, name in _ALIASES.items():
         if alias in entries and name not in entries:
@@ -62,11 +63,11 @@ def check_numbers(file: Path, whose: str, entries: dict[str, Any]) -> None:
 def frame_camera(
     file: Path, name: str, meta: Mapping[str, Any], frame: Mapping[str, Any], photo_size: Callable[[], tuple[int, int]]
 ) -> FrameCamera:
-    """Return the camera of a frame: its own entries, and for what these do not say those of the whole file.
+    """Return the camera of a frame, from its own entries and, where these are missing, from those of the whole file.
 
-    A focal length comes from fl_x and fl_y, or from the angles camera_angle_x (radians) or x_fov (degrees); one serves
-    both axes. Without a size it is that of the photo, ``photo_size``; without a principal point, the middle.
-    Raises ``UserError`` without a focal length, and for lenses that no camera here has.
+    The focal length comes from fl_x and fl_y, or from the angles camera_angle_x (radians) or x_fov (degrees); one of
+    them sets both axes. The size defaults to ``photo_size``, the principal point to the middle. Raises ``UserError``
+    without a focal length, and for lenses that are not supported.
     """
     width, height = _size(meta, frame, photo_size)
     fx, fy = _focal(meta, frame, width, height)
@@ -106,7 +107,7 @@ def _size(
 def _focal(
     meta: Mapping[str, Any], frame: Mapping[str, Any], width: int, height: int
 ) -> tuple[float | None, float | None]:
-    """Return the focal lengths of both axes; the frame's own one also replaces the other axis, in the file's ratio."""
+    """Return the focal lengths of both axes; a single one of the frame sets both, in the file's ratio."""
     fx, fy = _along(frame, "x", width), _along(frame, "y", height)
     common_x, common_y = _along(meta, "x", width), _along(meta, "y", height)
     common_x, common_y = common_x or common_y, common_y or common_x
@@ -129,7 +130,7 @@ def _along(entries: Mapping[str, Any], axis: str, pixels: int) -> float | None:
 
 
 def number(value: Any) -> Any:
-    """Return a number that is written as text as a number; anything else as it is."""
+    """Convert text to a number if it is one; return anything else unchanged."""
     if isinstance(value, str):
         try:
             return float(value) if math.isfinite(float(value)) else value

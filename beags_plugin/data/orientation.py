@@ -1,4 +1,4 @@
-"""Photos that are stored turned, with EXIF's word on how to hold them: images and masks between the two ways."""
+"""Photos stored turned, with an EXIF orientation: conversion of images and masks, and messages."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ LYING = (5, 6, 7, 8)  # its values that swap width and height
 def orientation(path: Path) -> int:
     """Return EXIF's orientation of a photo, 1 (upright) to 8; 1 without one, and for a photo that cannot be read."""
     try:
-        found = read_image(path, lambda image: image.getexif().get(TAG, 1))
+        value = read_image(path, lambda image: image.getexif().get(TAG, 1))
     except (UserError, FileNotFoundError):
         return 1
-    return found if found in range(1, 9) else 1
+    return value if value in range(1, 9) else 1
 
 
 def upright(image: np.ndarray, turned: int) -> np.ndarray:
-    """Return an image [H, W, ...] that is stored with EXIF's orientation ``turned`` as one holds it."""
+    """Turn an image [H, W, ...] stored with EXIF's orientation ``turned`` upright."""
     return _turned(image, turned, -1)
 
 
@@ -35,7 +35,7 @@ def as_stored(image: np.ndarray, turned: int) -> np.ndarray:
 
 
 def _turned(image: np.ndarray, turned: int, quarter: int) -> np.ndarray:
-    found = {
+    view = {
         1: lambda: image,
         2: lambda: image[:, ::-1],
         3: lambda: image[::-1, ::-1],
@@ -45,13 +45,13 @@ def _turned(image: np.ndarray, turned: int, quarter: int) -> np.ndarray:
         7: lambda: image[::-1, ::-1].swapaxes(0, 1),
         8: lambda: np.rot90(image, -quarter),
     }[turned]()
-    return np.ascontiguousarray(found)
+    return np.ascontiguousarray(view)
 
 
 def upright_mask_error(mask: Path | str, size: tuple[int, int], photo: Path, photo_size: tuple[int, int]) -> str | None:
-    """Return a sentence about a mask whose sides are those of its photo swapped; None unless EXIF turns the photo.
+    """Return a sentence on a mask whose sides are those of its photo swapped; None unless EXIF turns the photo.
 
-    mask: its file, or a word for it. size, photo_size: (width, height), the photo's as it is stored.
+    mask: its file, or words for it. size, photo_size: (width, height), the photo's as it is stored.
     """
     if size != photo_size[::-1] or size == photo_size or (turned := orientation(photo)) not in LYING:
         return None
@@ -64,7 +64,7 @@ def upright_mask_error(mask: Path | str, size: tuple[int, int], photo: Path, pho
 
 
 def sideways_photo_error(photo: Path, size: tuple[int, int], camera: tuple[int, int]) -> str | None:
-    """Return a sentence about poses that were made of upright photos; None unless EXIF turns this one."""
+    """Return a sentence on poses that were made from upright photos; None unless EXIF turns this photo."""
     if size == camera or size != camera[::-1] or (turned := orientation(photo)) not in LYING:
         return None
     return (
@@ -75,22 +75,22 @@ def sideways_photo_error(photo: Path, size: tuple[int, int], camera: tuple[int, 
 
 
 def turned_note(photos: Sequence[Path]) -> str | None:
-    """Return a sentence about photos that are stored turned, whose masks may be upright unnoticed; None without any.
+    """Return a sentence on photos that are stored turned and whose masks may be upright unnoticed; None without any.
 
-    Only orientations that keep the photo's size pass unnoticed: upside down, mirrored, or on its side in a square.
+    These are orientations that keep the photo's size: upside down, mirrored, or square photos on their side.
     """
-    found = []
+    stored = []
     for photo in photos:
         turned = orientation(photo)
         if turned == 1:
             continue
         size = read_image(photo, lambda image: image.size)
         if turned not in LYING or size[0] == size[1]:
-            found.append((photo, turned))
-    if not found:
+            stored.append((photo, turned))
+    if not stored:
         return None
-    photo, turned = found[0]
+    photo, turned = stored[0]
     return (
-        f"{len(found)} photos are stored turned, the first of them {photo} with EXIF orientation {turned}: masks must "
-        "lie as the photos are stored; turn upright ones with beags masks make --upright."
+        f"{len(stored)} photos are stored turned, the first of them {photo} with EXIF orientation {turned}: masks "
+        "must lie as the photos are stored; turn upright ones with beags masks make --upright."
     )

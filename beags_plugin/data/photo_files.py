@@ -1,4 +1,4 @@
-"""The files of photos that poses name, whatever the machine on which the poses were written."""
+"""Find the files of photos that poses name, also for poses written on another machine."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def plain_name(name: str) -> str:
 
 
 def without_suffix(name: str) -> str:
-    """Return a plain name without the suffix of an image; other dots belong to the name."""
+    """Return a plain name without an image suffix; other dots belong to the name."""
     suffix = PurePosixPath(name).suffix
     return name.removesuffix(suffix) if suffix.lower() in IMAGE_SUFFIXES else name
 
@@ -31,31 +31,30 @@ def without_suffix(name: str) -> str:
 class PhotoFinder:
     """Finds files below folders by names that were written elsewhere.
 
-    roots: folders, the first one counts first. A name means the file of exactly that path; else one whose path differs
-    in the slashes of Windows, in case, in spaces at its ends, in the form of its accents or in what web addresses
-    escape, lacks the suffix of
-    an image or has another one; else a file below the roots whose path is an end of the named one (images/a.jpg for
-    C:/scene/images/a.jpg), as far as no folder of the name's beginning exists.
+    roots: folders, in order of precedence. A name refers to the file of exactly that path; else to one whose path
+    differs in Windows' slashes, case, spaces at its ends, Unicode form or escapes of web addresses, or has no image
+    suffix or another one; else to a file whose path below the roots is the end of the name (images/a.jpg for
+    C:/scene/images/a.jpg), unless the folder at the beginning of the name exists.
     """
 
     def __init__(self, roots: Sequence[Path], loose_folders: bool = False) -> None:
-        """loose_folders: photos may lie in other folders than the names say, as smaller copies in one folder do."""
+        """Open the folders. loose_folders: photos may lie in other folders than named, as smaller copies often do."""
         self.roots, self.loose_folders = list(roots), loose_folders
         self._listed = cache(_listed)
 
     def find(self, names: Sequence[str]) -> list[Path | None]:
-        """Return the file of each name, None where there is none; no file stands for two names.
+        """Return the file of each name, or None; no file is returned for two names.
 
         Raises ``UserError`` if two files fit a name.
         """
-        found = [self.exact(name) for name in names]
-        taken = {path for path in found if path is not None}
-        guesses = {index: self.near(name) for index, name in enumerate(names) if found[index] is None}
+        files = [self.exact(name) for name in names]
+        taken = {path for path in files if path is not None}
+        guesses = {index: self.near(name) for index, name in enumerate(names) if files[index] is None}
         uses = Counter(path for path in guesses.values() if path is not None)
         for index, path in guesses.items():
             if path is not None and path not in taken and uses[path] == 1:
-                found[index] = path
-        return found
+                files[index] = path
+        return files
 
     def exact(self, name: str) -> Path | None:
         """Return the file of exactly this name, or None."""
@@ -65,7 +64,7 @@ class PhotoFinder:
         return next((path for path in paths if path.is_file()), None)
 
     def near(self, name: str) -> Path | None:
-        """Return the file that a name means if none has exactly that name, or None."""
+        """Return the file that a name most likely refers to if none has exactly that name, or None."""
         plain = plain_name(name)
         parts = [part for part in PurePosixPath(plain).parts if part.strip("/")]
         if not parts:
@@ -96,7 +95,7 @@ class PhotoFinder:
         return folder / alike[0] if len(alike) == 1 else None
 
     def _file(self, folder: Path, name: str) -> Path | None:
-        """Find a file by its name in other letters, without its suffix, or with that of another kind of image."""
+        """Find a file by its name in other spelling, without its suffix, or with that of another kind of image."""
         files = [entry for entry in self._listed(folder) if not entry.startswith(".")]
         images = [entry for entry in files if Path(entry).suffix.lower() in IMAGE_SUFFIXES]
         for alike in (
@@ -128,10 +127,10 @@ def _folded(name: str) -> str:
 
 
 def missing_note(missing: Sequence[Path], total: int, source: Path, strict: bool) -> str | None:
-    """Return a sentence about the photos that poses name and nobody finds; None where all are there.
+    """Return a sentence on missing photos; None without any.
 
-    missing: where they were looked for first. total: number of photos that ``source``, the file of the poses, names.
-    Raises ``UserError`` where more than half are missing, or any with ``strict``.
+    missing: the paths where they should be. total: number of photos that ``source``, the file of the poses, names.
+    Raises ``UserError`` if more than half are missing, or any with ``strict``.
     """
     if not missing:
         return None

@@ -7,23 +7,23 @@ from pathlib import Path
 import numpy as np
 
 from beags_plugin.data.dataset import PoseTable
-from beags_plugin.data.files import list_images, missing_numbers, numbered
+from beags_plugin.data.files import list_images, numbered
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.arrays import load_array
 from beags_plugin.system.reading.text import reason
 
 FILE = "poses_bounds.npy"
-# LLFF's camera axes are down, right, backward; OpenGL's right, up, backward.
+# LLFF's camera axes are down, right and backward; OpenGL's are right, up and backward.
 _TO_OPENGL = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def read_poses_bounds(file: Path, images: Path) -> PoseTable:
-    """Read the poses in ``file`` of the images in the folder ``images``, in the order of their names.
+    """Read the poses of the images in the folder ``images``, in the order of their names.
 
-    A row holds a 3 x 5 matrix [R | t | (height, width, focal length)], camera to world, in pixels of the original
-    images, then the nearest and the farthest depth. The principal point is the centre. The lens distortion comes from
-    COLMAP's sparse/0/cameras.
-    Raises ``UserError`` for another content, or if the numbers of rows and images differ.
+    A row of the file holds a 3 x 5 matrix [R | t | (height, width, focal length)], camera to world, in pixels of the
+    original images, then the nearest and the farthest depth. The principal point is the centre. The lens distortion
+    comes from COLMAP's sparse/0/cameras. Raises ``UserError`` for other content, and if the numbers of rows and images
+    differ.
     """
     try:
         rows = load_array(file)
@@ -36,15 +36,13 @@ def read_poses_bounds(file: Path, images: Path) -> PoseTable:
         )
     rows = rows.astype(np.float64)
     if not np.isfinite(rows).all():
-        raise UserError(f"the poses {file} hold what is no finite number, such as NaN: save them as LLFF does.")
+        raise UserError(f"the poses {file} hold a value such as NaN that is not finite: save them as LLFF does.")
     files = list_images(images)
-    missing: tuple[Path, ...] = ()
-    if (places := numbered(files, len(rows))) is not None:
-        missing = missing_numbers(files, places, len(rows))
-        rows = rows[places]
+    places, missing = numbered(files, len(rows))
+    rows = rows if places is None else rows[places]
     if len(files) != len(rows):
         raise UserError(
-            f"{file} has {len(rows)} poses but {images} {len(files)} images: keep the images that the poses are of."
+            f"{file} has {len(rows)} poses but {images} {len(files)} images: keep the images that have poses."
         )
     matrices = rows[:, :15].reshape(-1, 3, 5).astype(np.float64)
     height, width, focal = matrices[:, :, 4].T

@@ -1,4 +1,4 @@
-"""Downscaling of photos for a training of minutes."""
+"""Downscaling of photos for a training that takes minutes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from beags_plugin.data.photo_files import PhotoFinder
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import load_json
 
-QUICK_PIXELS = 50_000  # per view, at most
+QUICK_PIXELS = 50_000  # most pixels of a view
 
 
 def quick_downscale(data: Path) -> float:
-    """Return the whole factor that brings the images of ``data`` to ``QUICK_PIXELS`` or less."""
+    """Return the smallest whole factor that scales the images of ``data`` to at most ``QUICK_PIXELS``."""
     images = _images(data) or _first_frame(data)
     if not images:
         return 1.0  # the data parser names what is missing
@@ -40,10 +40,10 @@ def _images(data: Path) -> list[Path]:
 
 
 def _first_frame(data: Path) -> list[Path]:
-    """Return the first image of transforms.json that is there; none without, or if that file is damaged."""
+    """Return the first image of transforms.json that exists; empty without one, or if that file is damaged."""
     try:
         names = [str(frame["file_path"]) for frame in load_json(data / "transforms.json")["frames"]]
-        found = PhotoFinder([data, data / "images"]).find(names)
+        files = PhotoFinder([data, data / "images"]).find(names)
     except (OSError, ValueError, LookupError, TypeError, UserError):  # the data parser names what is wrong
         return []
-    return [path for path in found if path is not None][:1]
+    return [path for path in files if path is not None][:1]

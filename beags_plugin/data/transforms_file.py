@@ -1,4 +1,4 @@
-"""transforms.json of nerfstudio and of other programs, checked before poses are made of it."""
+"""Read and check transforms.json of nerfstudio and other programs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ def read_transforms(file: Path) -> dict[str, Any]:
     check_numbers(file, "it", meta)
     seen: set[str] = set()
     for index, frame in enumerate(frames):
-        name = _checked_name(file, index, frame)
+        name = frame.get("file_path") if isinstance(frame, dict) else None
+        if not isinstance(name, str) or not name or "\0" in name:
+            raise UserError(f"frame {index + 1} of {file} has no file_path: give it the path of its image.")
         if name in seen:
             raise UserError(f"{file} gives {name} two poses: keep one of its frames.")
         seen.add(name)
@@ -37,15 +39,8 @@ def read_transforms(file: Path) -> dict[str, Any]:
     return meta
 
 
-def _checked_name(file: Path, index: int, frame: Any) -> str:
-    name = frame.get("file_path") if isinstance(frame, dict) else None
-    if not isinstance(name, str) or not name or "\0" in name:
-        raise UserError(f"frame {index + 1} of {file} has no file_path: give it the path of its image.")
-    return name
-
-
 def _checked_matrix(file: Path, name: str, matrix: Any) -> list[list[float]]:
-    """Return 3 or 4 rows of a pose, which may also be written as one list, or as text."""
+    """Return the 3 or 4 rows of a pose, which may also be one list, and whose numbers may be text."""
     if isinstance(matrix, list) and len(matrix) in (12, 16) and not any(isinstance(each, list) for each in matrix):
         matrix = [matrix[at : at + 4] for at in range(0, len(matrix), 4)]
     if not _is_matrix(matrix):
@@ -54,7 +49,7 @@ def _checked_matrix(file: Path, name: str, matrix: Any) -> list[list[float]]:
         )
     matrix = [[number(value) for value in row] for row in matrix]
     if not all(finite(value) for row in matrix for value in row):
-        raise UserError(f"the transform_matrix of {name} in {file} holds what is no finite number: correct it.")
+        raise UserError(f"the transform_matrix of {name} in {file} holds a value that is no finite number: correct it.")
     return matrix
 
 
@@ -66,7 +61,7 @@ def _is_matrix(matrix: Any) -> bool:
 
 
 def _check_rest(file: Path, meta: dict[str, Any]) -> None:
-    """Raise ``UserError`` for wrong entries of the whole file that say how the world was turned and what lies in it."""
+    """Raise ``UserError`` for wrong entries of the whole file: its transform, its points and its splits."""
     applied = meta.get("applied_transform")
     if applied is not None and not (_is_matrix(applied) and all(finite(value) for row in applied for value in row)):
         raise UserError(f"{file} has an applied_transform that is no matrix of 3 x 4 numbers: correct or remove it.")

@@ -7,19 +7,19 @@ import torch
 from torch import Tensor
 
 BACKGROUND = 0  # everything that is no object
-IGNORE = 65535  # an unlabelled pixel: it neither votes nor is penalised
+IGNORE = 65535  # an unlabelled pixel, which casts no vote and enters no loss
 
 
 def objects_in(labels: Tensor) -> list[int]:
-    """Return the ascending ids of the objects in labels [H, W] int, without background (0) and IGNORE."""
-    found = torch.bincount(labels.reshape(-1)).nonzero()[:, 0].tolist()
-    return [class_id for class_id in found if class_id not in (0, IGNORE)]
+    """Return the ids of the objects in labels [H, W] int, ascending, without background and IGNORE."""
+    ids = torch.bincount(labels.reshape(-1)).nonzero()[:, 0].tolist()
+    return [class_id for class_id in ids if class_id not in (BACKGROUND, IGNORE)]
 
 
 def resize_nearest(labels: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Resize a map [H', W'] to [height, width] by the old pixel under each new centre (OpenCV's is half a pixel off).
+    """Resize a map [H', W'] to [height, width]: each new pixel takes the old pixel under its centre.
 
-    The arithmetic is in integers: (i + 0.5) old / new, rounded down.
+    The old index is (i + 0.5) old / new, rounded down, in integers; OpenCV's is half a pixel off.
     """
     rows = (2 * np.arange(height) + 1) * labels.shape[0] // (2 * height)
     columns = (2 * np.arange(width) + 1) * labels.shape[1] // (2 * width)

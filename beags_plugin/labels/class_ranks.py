@@ -9,16 +9,16 @@ from beags_plugin.labels.class_ids import IGNORE
 
 
 class ClassRanks:
-    """Ranks 0, 1, ... of class ids in ascending order, which keeps the order of ties between classes.
+    """Ranks 0, 1, ... of class ids in ascending order, so that ties between classes are decided as by ids.
 
-    Arrays with an entry per class then grow with the number of classes, not with the largest id (up to 65534).
-    ids: int tensor of any shape, 0 .. 65534, repeated or not. Background (0) is always included.
+    Arrays with an entry per class then grow with the number of classes, not with the largest id (up to 65534). ids: int
+    tensor of any shape, 0 .. 65534, repeated or not; background (0) is always included.
     """
 
     def __init__(self, ids: Tensor) -> None:
         ids = ids.reshape(-1).int()
         self.ids = torch.unique(torch.cat([ids.new_zeros(1), ids]))  # sorted
-        # Table of the ids -1, 0, ... to one past the last: a fifth of the time of a search, 256 KB at most.
+        # A table of the ids -1, 0, ... to one past the last takes a fifth of the time of a search, and at most 256 KB.
         self._table = self.ids.new_full((int(self.ids[-1]) + 3,), len(self.ids))
         self._table[self.ids.long() + 1] = torch.arange(len(self.ids), dtype=torch.int32, device=ids.device)
 

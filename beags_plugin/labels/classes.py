@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
+from beags_plugin.labels.id_checks import check_ids, check_palettes
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.pasted import quoted
 from beags_plugin.system.reading.images import read_image
@@ -19,19 +21,20 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 NO_TRUTH = "no_truth.json"
-"""In a folder of masks: a program drew those of all views, so that held-out ones are no truth to evaluate with."""
+"""File in a folder of masks that says that a program drew them all, so that held-out ones are no ground truth."""
 UNTOLD = 128
-"""Grey value in the mask of one object of a pixel that cannot be told to be inside or outside."""
-SHADES = slice(32, 224)  # values of 8 bits that are neither black nor white
-MOST_SHADED, LEAST_SHADES = 0.25, 64  # share of a mask's pixels with shades, and number of shades: more is a picture
+"""Grey value, in the mask of one object, of a pixel that may be inside or outside."""
+SHADES = slice(32, 224)  # 8-bit values that are neither black nor white
+MOST_SHADED, LEAST_SHADES = 0.25, 64  # share of shaded pixels, and number of shades, above which a mask is a picture
 _ID_MODES = {"1", "L", "P", "I", "I;16", "I;16L", "I;16B"}  # Pillow's names of images with one integer per pixel
 _COLOR_MODES = {"RGB", "RGBA", "LA"}
 
 
 def read_id_mask(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarray:
     """Read class ids [H, W] uint16 from an 8-bit grey, 16-bit grey or palette image (its indices, not its colours).
-    ignore_ids: ids of an 8-bit image that mean "unlabelled", e.g. 255; they become IGNORE (65535).
-    Raises ``UserError`` for any other file.
+
+    ignore_ids: ids of an 8-bit image that mean "unlabelled", such as 255; they become IGNORE (65535). Raises
+    ``UserError`` for any other file.
     """
     mode, values = _read_pixels(path)
     if mode in _COLOR_MODES and _is_grey(mode, values):
@@ -55,14 +58,14 @@ def read_id_mask(path: Path | str, ignore_ids: Iterable[int] = ()) -> np.ndarray
 
 
 def _is_grey(mode: str, values: np.ndarray) -> bool:
-    """Return whether a colour image has equal channels, and alpha, if any, of one value."""
+    """Return whether a colour image has equal channels, and a constant alpha if any."""
     alpha, colors = values[..., -1:], values[..., : 1 if mode == "LA" else 3]
     opaque = mode == "RGB" or bool((alpha == alpha.flat[0]).all())
     return opaque and bool((colors == colors[..., :1]).all())
 
 
 def palette_of(path: Path | str) -> dict[int, tuple[int, int, int]] | None:
-    """Return the colours of the ids in a palette image; None for another image and for a palette of greys by value."""
+    """Return the colours of the ids in a palette image; None for other images, and if each colour is its index."""
 
     def read(image: Image) -> dict[int, tuple[int, int, int]] | None:
         if image.mode != "P" or image.palette is None:
@@ -71,20 +74,20 @@ def palette_of(path: Path | str) -> dict[int, tuple[int, int, int]] | None:
         colors = np.zeros((256, 3), np.uint8)
         given = np.array(image.convert("P").getpalette("RGB") or [], np.uint8).reshape(-1, 3)
         colors[: len(given)] = given[:256]
-        found = {index: tuple(int(value) for value in colors[index]) for index in used}
-        return None if all(color == (index,) * 3 for index, color in found.items()) else found  # type: ignore[return-value]
+        palette = {index: tuple(int(value) for value in colors[index]) for index in used}
+        return None if all(color == (index,) * 3 for index, color in palette.items()) else palette  # type: ignore[return-value]
 
     return read_image(path, read, "the mask", "save it as PNG again")
 
 
 def read_object_mask(path: Path | str, truth: bool = False) -> np.ndarray:
-    """Read the mask of one object, [H, W] uint16: 1 inside, 0 outside, IGNORE where that cannot be told.
+    """Read the mask of one object, [H, W] uint16: 1 inside, 0 outside, IGNORE where that is unknown.
 
-    In 8-bit grey or colour images that reach 128, pixels are inside from 128 on, as outlines may be blended. But in an
-    image of no other values than 0, 128 and 255, with 255 in it, grey 128 is ``UNTOLD``: a blended outline has more
-    shades. In other images, such as labels 0 and 1, all but 0 and IGNORE is inside. Alpha is ignored.
-    truth: whether 128 is ``UNTOLD`` without 255 too, as in a silhouette of which nothing can be told.
-    Raises ``UserError`` for any other file, a photo among them.
+    In 8-bit grey or colour images that reach 128, values of 128 or more are inside, as outlines may be blended. But in
+    an image with the values 0, 128 and 255 alone, with 255 in it, grey 128 is ``UNTOLD``: a blended outline has more
+    shades. In other images, such as labels 0 and 1, all values but 0 and IGNORE are inside. Alpha is ignored. truth:
+    whether 128 is ``UNTOLD`` also without 255, as in a silhouette that is unknown everywhere. Raises ``UserError`` for
+    any other file, such as a photo.
     """
     mode, values = _read_pixels(path)
     if mode in _COLOR_MODES:
@@ -111,13 +114,13 @@ def read_binary_mask(path: Path | str) -> np.ndarray:
 
 
 def _is_picture(values: np.ndarray) -> bool:
-    """Return whether many pixels have many shades; blended outlines are few, labels have few values."""
+    """Return whether many pixels have many shades; blended outlines are few pixels, and labels few values."""
     counts = np.bincount(values.ravel(), minlength=256)[SHADES]
     return bool(counts.sum() > MOST_SHADED * values.size and np.count_nonzero(counts) > LEAST_SHADES)
 
 
 def read_mask(path: Path | str, kind: str, ignore_ids: Iterable[int] = ()) -> np.ndarray:
-    """Read [H, W] uint16: the class ids of an id image ("ids"), or 1, 0 or IGNORE of a "binary" mask."""
+    """Read the class ids of an id image (kind "ids"), or 1, 0 or IGNORE of a "binary" mask, [H, W] uint16."""
     return read_object_mask(path) if kind == "binary" else read_id_mask(path, ignore_ids)
 
 
@@ -167,9 +170,9 @@ def check_names(names: Mapping[int, str]) -> None:
 def read_classes(path: Path | str | None, ids_present: Iterable[int] | None = None) -> dict[int, str]:
     """Read class names by ascending id from a JSON file {"id": "name"}; background (0) is added.
 
-    path: None, or (with ``ids_present``) a missing file, names nothing.
-    ids_present: ids in the masks; those without a name get "class_<id>". IGNORE is left out.
-    Raises ``UserError`` for invalid JSON, an id outside 0..65534, an empty name, or a repeated name or id.
+    path: None, or a missing file if ``ids_present`` is given, names no class. ids_present: ids in the masks; those
+    without a name get "class_<id>". IGNORE is left out. Raises ``UserError`` for invalid JSON, an id outside 0..65534,
+    an empty name, or a repeated name or id.
     """
     names = {BACKGROUND: "background"}
     if path is not None and (ids_present is None or Path(path).exists()):
@@ -200,8 +203,8 @@ def _read_names(path: Path) -> dict[int, str]:
     for key, name in pairs:
         digits = key.isascii() and key.isdigit()
         if not digits or len(key) > 9 or int(key) >= IGNORE:  # Python refuses to convert thousands of digits
-            shown = key if len(key) <= 40 else f"{key[:37]}..."
-            raise UserError(f"{path} has the class id {shown!r}: ids are whole numbers in 0..{IGNORE - 1}.")
+            short = key if len(key) <= 40 else f"{key[:37]}..."
+            raise UserError(f"{path} has the class id {short!r}: ids are whole numbers in 0..{IGNORE - 1}.")
         if not isinstance(name, str) or not name.strip():
             raise UserError(f"{path} gives class {key} no name: write a non-empty string.")
         if not name.strip().isprintable():
@@ -210,3 +213,39 @@ def _read_names(path: Path) -> dict[int, str]:
             raise UserError(f"{path} names class {int(key)} twice: keep one of the lines.")
         names[int(key)] = name.strip()
     return names
+
+
+def read_class_names(
+    classes_file: Path,
+    masks: Sequence[Path],
+    ignore_ids: Sequence[int],
+    known: Mapping[int, str] | None = None,
+    known_file: Path | None = None,
+) -> dict[int, str]:
+    """Return the class names by ascending id: from ``classes_file``, else ``known``, else ``class_<id>``.
+
+    masks: id images, each read once. known, known_file: names from the layout, and their file. Raises ``UserError`` if
+    names are given but a mask holds an id without one, and for masks that look damaged (``labels.id_checks``).
+    """
+
+    def ids_in(mask: Path) -> set[int]:
+        labels = read_id_mask(mask, ignore_ids)
+        check_ids(mask, labels)
+        return set(np.flatnonzero(np.bincount(labels.ravel(), minlength=IGNORE + 1)).tolist()) - {IGNORE}
+
+    with ThreadPoolExecutor(max_workers=4) as pool:  # decoding a .png releases the interpreter
+        ids_of_masks = list(pool.map(ids_in, masks))
+        check_palettes(masks, list(pool.map(palette_of, masks)))
+    if classes_file.is_file():
+        classes, source = read_classes(classes_file), classes_file
+    elif known is not None:
+        classes, source = dict(sorted({BACKGROUND: "background", **known}.items())), known_file or classes_file
+    else:
+        return read_classes(None, sorted(set().union(*ids_of_masks)))
+    for mask, ids in zip(masks, ids_of_masks, strict=True):
+        if unknown := sorted(ids - classes.keys()):
+            raise UserError(
+                f"the mask {mask} holds id {unknown[0]}, which {source} does not name: "
+                f"add it there, correct the mask, or list it in ignore_ids."
+            )
+    return classes

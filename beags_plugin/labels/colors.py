@@ -10,7 +10,10 @@ from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 
 
 def colorize(labels: np.ndarray) -> np.ndarray:
-    """Return [H, W, 3] uint8 RGB of labels [H, W]: one colour per id in all scenes, background black, IGNORE grey."""
+    """Return the colours of labels [H, W], [H, W, 3] uint8 RGB: the same for an id in all scenes.
+
+    Background is black, IGNORE grey.
+    """
     ids, inverse = np.unique(np.asarray(labels), return_inverse=True)
     colors = np.array([_color(int(class_id)) for class_id in ids], dtype=np.uint8).reshape(-1, 3)
     return colors[inverse.reshape(np.shape(labels))]

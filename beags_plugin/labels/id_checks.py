@@ -1,4 +1,4 @@
-"""Signs that an image of class ids was spoilt: smoothed, compressed with loss, or saved with palettes that differ."""
+"""Signs that an image of class ids was damaged: smoothing, lossy compression, or palettes that differ."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import numpy as np
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.system.errors import UserError
 
-LEAST_RAMPS = 12  # outlines crossed by rows and columns over a value between: fewer may be chance
-RAMPS = 0.3  # share of crossings with a value between; thin objects have few, a smoothed mask of ids 0 and 2 has half
+LEAST_RAMPS = 12  # least outlines with a value in between, over all rows and columns; fewer may be chance
+RAMPS = 0.3  # least share of such outlines; thin objects cause few, a smoothed mask of ids 0 and 2 has half
 _WIDTHS = {1: RAMPS, 2: 0.8}
-"""Pixels of a value between, and that share. Rims of two may be thin things, unless their ids fill areas elsewhere."""
-LEAST_SOLID = 0.2  # share of pixels amid 3 x 3 of one id: less is noise, which has no outlines
-MOST_DUST = 8  # ids that fill no area of 3 x 3 pixels, but lie about in so many pieces each:
+"""Width in pixels of the value in between, to that share. A rim of two pixels may be a thin object, unless its id also
+fills areas."""
+LEAST_SOLID = 0.2  # least share of pixels amid 3 x 3 of one id; an image with less is noise, which has no outlines
+MOST_DUST = 8  # ids that fill no area of 3 x 3 pixels but lie about in ``PIECES`` pieces each, from which a mask is bad
 PIECES = 4
-MOST_IN_DUST = 0.5  # share of all pixels in ids that fill no area: more is a picture
+MOST_IN_DUST = 0.5  # share of pixels with ids that fill no area, above which an image is a picture
 
 _COLORS = "beags masks make --source id-images --options folder=FOLDER colors=true"
 
 
 def check_ids(path: Path | str, labels: np.ndarray) -> None:
-    """Raise ``UserError`` for labels [H, W] of a file that look smoothed or compressed with loss."""
-    found = np.unique(labels)
-    if len(found) < 3 or min(labels.shape) < 3:
+    """Raise ``UserError`` for labels [H, W] of a file that look smoothed or lossily compressed."""
+    if len(np.unique(labels)) < 3 or min(labels.shape) < 3:
         return
     if (between := _ramps(labels)) is not None and _solid(labels).mean() >= LEAST_SOLID:
         raise UserError(
@@ -36,7 +36,7 @@ def check_ids(path: Path | str, labels: np.ndarray) -> None:
 
 
 def check_areas(path: Path | str, labels: np.ndarray, what: str) -> None:
-    """Raise ``UserError`` for labels [H, W] with many ids that fill no area; what: the user's word for ids."""
+    """Raise ``UserError`` for labels [H, W] with many ids that fill no area. what: "values", or "colours"."""
     if min(labels.shape) < 3:
         return
     counts = np.bincount(labels.ravel())
@@ -45,7 +45,7 @@ def check_areas(path: Path | str, labels: np.ndarray, what: str) -> None:
     share = counts[fine].sum() / labels.size
     if what == "colours" and fine.sum() > 256 and share >= MOST_IN_DUST:
         raise UserError(f"the mask {path} is a picture of {fine.sum()} colours: give images of one colour per object.")
-    corner = np.ones(labels.shape, bool)  # pixels without the same id to the left and above: one or two a piece
+    corner = np.ones(labels.shape, bool)  # pixels whose id is neither to the left nor above: one or two a piece
     corner[:, 1:] &= labels[:, 1:] != labels[:, :-1]
     corner[1:] &= labels[1:] != labels[:-1]
     pieces = np.bincount(labels[corner], minlength=len(counts))
@@ -59,7 +59,7 @@ def check_areas(path: Path | str, labels: np.ndarray, what: str) -> None:
 
 
 def _ramps(labels: np.ndarray) -> list[int] | None:
-    """Return the ids that lie between others along most outlines; None where outlines are hard."""
+    """Return the ids that lie between others along most outlines; None for hard outlines."""
     values = labels.astype(np.int32)
     for widest, share in _WIDTHS.items():
         crossings, ramps, seen = _crossings(values, widest)
@@ -71,10 +71,10 @@ def _ramps(labels: np.ndarray) -> list[int] | None:
 
 
 def _crossings(values: np.ndarray, widest: int) -> tuple[int, int, set[int]]:
-    """Return the numbers of outlines that rows and columns of ``values`` [H, W] int32 cross, and of ramps among them.
+    """Return the numbers of outlines and of ramps along rows and columns, and the ids within ramps.
 
-    A ramp climbs or falls by way of ids of at most ``widest`` pixels each, which the last part lists. Jumps to a
-    neighbouring id do not count: nothing lies between. Jumps to and from IGNORE are no outlines.
+    values: [H, W] int32. A ramp rises or falls through ids of at most ``widest`` pixels each. Jumps to the next id do
+    not count, as no id lies between. Jumps to and from IGNORE are no outlines.
     """
     crossings = ramps = 0
     seen: set[int] = set()
@@ -84,7 +84,7 @@ def _crossings(values: np.ndarray, widest: int) -> tuple[int, int, set[int]]:
         row, at = np.nonzero(jump)
         size = jump[row, at]
         near = (row[1:] == row[:-1]) & (at[1:] - at[:-1] <= widest)
-        goes_on = near & (np.sign(size[1:]) == np.sign(size[:-1]))  # what lies between two jumps lies between in value
+        goes_on = near & (np.sign(size[1:]) == np.sign(size[:-1]))  # the id between also lies between in value
         before, after = np.zeros(len(size), bool), np.zeros(len(size), bool)
         before[1:], after[:-1] = goes_on, goes_on
         begun = int((after & ~before).sum())
@@ -95,7 +95,7 @@ def _crossings(values: np.ndarray, widest: int) -> tuple[int, int, set[int]]:
 
 
 def _solid(labels: np.ndarray) -> np.ndarray:
-    """Return which pixels [H - 2, W - 2], without the rim, lie amid 3 x 3 of one id."""
+    """Return the pixels amid 3 x 3 of one id, [H - 2, W - 2] bool, without the image's rim."""
     middle = labels[1:-1, 1:-1]
     same = np.ones(middle.shape, bool)
     for row in range(3):
@@ -107,7 +107,7 @@ def _solid(labels: np.ndarray) -> np.ndarray:
 def check_palettes(masks: Sequence[Path], palettes: Sequence[Mapping[int, tuple[int, int, int]] | None]) -> None:
     """Raise ``UserError`` where palette images give one colour different ids, or black another id than the background.
 
-    palettes: of each mask the colours of the ids in it; None where it has no palette, or one of greys.
+    palettes: for each mask the colours of its ids, or None (``labels.classes.palette_of``).
     """
     known: dict[tuple[int, int, int], tuple[int, Path]] = {}
     for path, palette in zip(masks, palettes, strict=True):
@@ -128,5 +128,5 @@ def check_palettes(masks: Sequence[Path], palettes: Sequence[Mapping[int, tuple[
 
 
 def _listed(ids: Sequence[int]) -> str:
-    shown = ", ".join(map(str, ids[:5]))
-    return f"{shown}, ..." if len(ids) > 5 else shown
+    listed = ", ".join(map(str, ids[:5]))
+    return f"{listed}, ..." if len(ids) > 5 else listed

@@ -36,7 +36,7 @@ def to_int32(labels: Tensor) -> Tensor:
 
 
 class CompressedMap:
-    """A map [H, W] for ``to_compact`` (or any uint8 image), narrow and compressed: kilobytes for a photo's classes."""
+    """Labels [H, W], or any uint8 image, narrow and compressed: kilobytes for a photo's classes."""
 
     def __init__(self, labels: Tensor) -> None:
         array = to_compact(labels.detach()).cpu().contiguous().numpy()
@@ -44,14 +44,9 @@ class CompressedMap:
         self.packed = zlib.compress(array.tobytes(), level=1)
 
     def unpacked(self) -> Tensor:
-        """Return the map [H, W] of ``to_compact``, on its former device."""
+        """Return the map [H, W] in the type of ``to_compact``, on its former device."""
         array = np.frombuffer(bytearray(zlib.decompress(self.packed)), self.dtype)
         return torch.from_numpy(array.reshape(self.shape)).to(self.device)
-
-    @property
-    def pixels(self) -> int:
-        """Number of pixels."""
-        return int(np.prod(self.shape))
 
 
 class CompressedMaps(Sequence[Tensor]):
@@ -69,14 +64,14 @@ class CompressedMaps(Sequence[Tensor]):
 
     def __getitem__(self, index: int | slice) -> Any:
         """Return [H, W] uint8 of one view, or a list for a slice."""
-        found = self.stored[index]
-        return found.unpacked() if isinstance(found, CompressedMap) else [each.unpacked() for each in found]
+        stored = self.stored[index]
+        return stored.unpacked() if isinstance(stored, CompressedMap) else [each.unpacked() for each in stored]
 
 
 class LabelMaps(Sequence[Any]):
-    """One label map [H, W], or None, per view: held narrow and compressed, read as int32.
+    """One label map [H, W], or None, per view: stored narrow and compressed, read as int32.
 
-    maps: class ids or IGNORE, int32 or of ``to_compact``; a ``CompressedMap`` is kept as it is.
+    maps: class ids or IGNORE, int32 or of ``to_compact``; a ``CompressedMap`` is stored as it is.
     """
 
     def __init__(self, maps: Iterable[Tensor | CompressedMap | None] = ()) -> None:
@@ -92,7 +87,7 @@ class LabelMaps(Sequence[Any]):
         return len(self.stored)
 
     def __getitem__(self, index: int | slice) -> Any:
-        """Return [H, W] int32 or None of one view; for a slice, ``LabelMaps`` of the same held maps."""
+        """Return [H, W] int32 or None of one view; for a slice, ``LabelMaps`` of the same stored maps."""
         if isinstance(index, slice):
             return LabelMaps(self.stored[index])
         narrow = self.narrow(index)
@@ -100,5 +95,5 @@ class LabelMaps(Sequence[Any]):
 
     def narrow(self, index: int) -> Tensor | None:
         """Return the map [H, W] of one view in its narrow type, or None."""
-        found = self.stored[index]
-        return None if found is None else found.unpacked()
+        stored = self.stored[index]
+        return None if stored is None else stored.unpacked()

@@ -1,15 +1,16 @@
 """Masks of all views that agree in space: one decision per Gaussian, from which the masks are drawn anew.
 
-A vote per pixel cannot mend what a third of the views have wrong together. Here a view that contradicts the others
-loses its say, and the classes of Gaussians are a minimum cut of the surface's graph, as in ``cutter``. With the light
-L_vic that Gaussian i gives to the pixels of view v that its mask calls c, and the say a_v of the view,
+A vote per pixel cannot correct an error that a third of the views share. Here a view that contradicts the others loses
+weight, and the classes of Gaussians are a minimum cut of the surface's graph, as in ``picking.cutter``. With the light
+L_vic that Gaussian i gives to the pixels of view v that its mask labels c, and the weight a_v of the view,
 
     S_ic = sum_v a_v L_vic,   p_ic = S_ic / (sum_c' S_ic' + 1),   c_i = argmax_c S_ic,
     e_v = sum_{i, c != c_i} L_vic / sum_{i, c or c_i an object} L_vic,   a_v = 1 / (1 + (e_v / median e)^2),
 
-and 0 where e_v exceeds ``SILENT``; a few rounds settle both. A view that shows no object starts without a say: the
-network found nothing there, which does not mean that nothing is there. Each object's cut has the unary terms
-0.3 logit p_ic beside the links of ``graph``, which cut along creases, depth edges and changes of colour.
+and 0 where e_v exceeds ``SILENT``; both settle in a few rounds. A view whose mask shows no object starts with weight 0,
+because a network that found nothing there may have missed the object. Each object's cut has the unary terms
+0.3 logit p_ic, and the links of ``picking.graph``, which are cheap to cut along creases, depth edges and changes of
+colour.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ from beags_plugin.picking.sight import seen_from
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import draw_features, geometry_inputs
 
-ROUNDS = 4  # The views are weighed, and the votes by them, so many times.
-LEAST_ERROR = 0.02  # of the median e: outlines alone make as much, so that it sets no view apart
-SILENT = 0.5  # of e: a mask that is more wrong than right has no say, and is drawn anew from the other views
-CONTRADICTS = 1.5  # of the usual e: a mask that errs less keeps all its pixels, as Gaussians are coarser than photos
-BELIEF, LIMIT = 0.3, 0.02  # of the logit of p beside links of at most 1; of p, so that its logit is finite
-NO_VOTE = 0.4  # of a pixel, for the object: where nothing votes, a Gaussian is rather not the object's
-SURE = 0.15  # of |p - 1/2|: the votes alone decide, else the cut does
-DRAWN = 0.5  # share of a pixel's light from which on it shows a class
+ROUNDS = 4  # rounds in which weights are computed from errors, and errors from weighted votes
+LEAST_ERROR = 0.02  # lower bound of the median e: outlines alone cause as much
+SILENT = 0.5  # largest e of a mask with weight: one that is more wrong than right is redrawn from the other views
+CONTRADICTS = 1.5  # e, in medians, up to which a mask keeps all its pixels, as Gaussians are coarser than photos
+BELIEF, LIMIT = 0.3, 0.02  # weight of logit p beside links of at most 1; bound of p that keeps its logit finite
+NO_VOTE = 0.4  # prior votes for the object, out of 1: a Gaussian without votes is more likely background
+SURE = 0.15  # least p - 1/2 at which votes alone make a class certain
+DRAWN = 0.5  # least share of a pixel's light that a class needs to label it
 
 Progress = Callable[[int, int], None]
 
@@ -47,32 +48,35 @@ Progress = Callable[[int, int], None]
 class Agreement:
     """The decisions on N Gaussians by the masks of V views.
 
-    class_ids: [N] int32. sure: [N] bool, where the votes say clearly what the cut says. errors: [V] float64, e_v; NaN
-    without a mask. say: [V] float64, a_v; 0 for a view that has lost its say or shows no object. light: [N] float64, of
-    all classes, by the say of the views.
+    class_ids: [N] int32. sure: [N] bool, where the votes clearly support the cut. errors: [V] float64, e_v; NaN without
+    a mask. weights: [V] float64, a_v; 0 for a view that is silenced or shows no object. light: [N] float64, the
+    weighted light over all classes.
     """
 
     class_ids: Tensor
     sure: Tensor
     errors: np.ndarray
-    say: np.ndarray
+    weights: np.ndarray
     light: np.ndarray
 
     @property
     def contradicted(self) -> list[int]:
-        """Return the views whose masks the others contradict more than is usual, ascending."""
-        return [int(view) for view in np.flatnonzero(self.errors > CONTRADICTS * usual(self.errors))]
+        """Return the views whose errors are well above the median, ascending."""
+        return [int(view) for view in np.flatnonzero(self.errors > CONTRADICTS * median_error(self.errors))]
 
     @property
     def silenced(self) -> list[int]:
-        """Return the views whose masks are not believed at all, ascending; those without a mask are not among them."""
-        return [int(view) for view in np.flatnonzero((self.say == 0) & ~np.isnan(self.errors))]
+        """Return the views with a mask of weight 0, ascending."""
+        return [int(view) for view in np.flatnonzero((self.weights == 0) & ~np.isnan(self.errors))]
 
 
 @dataclass(frozen=True)
 class AgreedMask:
-    """The labels of a view [H, W] int32 after agreement: class ids or IGNORE. changed, doubtful: [H, W] bool, pixels
-    whose class is another than given, and pixels left unlabelled because neither side is sure."""
+    """The labels of a view [H, W] int32 after agreement: class ids or IGNORE.
+
+    changed: [H, W] bool, pixels whose class differs from the given one. doubtful: [H, W] bool, pixels left unlabelled
+    because no class is certain.
+    """
 
     labels: Tensor
     changed: Tensor
@@ -93,22 +97,21 @@ def decide(
     labels: per camera [H, W] int32 class ids below ``num_classes`` or IGNORE, or None. progress: receives (done, total)
     views.
     """
-    steps = None if progress is None else (lambda done, _: progress(done, len(labels)))
     seen, normals = seen_from(surfels, cameras, rasterizer, settings)
     graph = surface_graph(surfels, seen, normals)
-    votes = _Votes(surfels, cameras, labels, rasterizer, settings, num_classes, steps)
-    say, errors = votes.say_from_start(), np.full(len(labels), np.nan)
+    votes = _Votes(surfels, cameras, labels, rasterizer, settings, num_classes, progress)
+    weights, errors = votes.shows_object.astype(np.float64), np.full(len(labels), np.nan)
     for _ in range(ROUNDS):
-        errors = votes.errors(votes.sums(say))
-        say = votes.say(errors)
-    sums = votes.sums(say)
+        errors = votes.errors(votes.sums(weights))
+        weights = votes.weights(errors)
+    sums = votes.sums(weights)
     total = sums.sum(axis=1)
     share = sums / np.maximum(total, 1e-12)[:, None]
     claims = np.stack([_claimed(graph, sums[:, c], total) for c in range(1, num_classes)], axis=1)
     class_ids = np.where(claims.any(axis=1), np.where(claims, share[:, 1:], -1.0).argmax(axis=1) + 1, BACKGROUND)
     own = np.take_along_axis(sums, class_ids[:, None], axis=1)[:, 0]
     sure = own / np.maximum(total + 1.0, 1.0) > 0.5 + SURE
-    return Agreement(torch.from_numpy(class_ids.astype(np.int32)), torch.from_numpy(sure), errors, say, total)
+    return Agreement(torch.from_numpy(class_ids.astype(np.int32)), torch.from_numpy(sure), errors, weights, total)
 
 
 def _claimed(graph: SurfaceGraph, of_object: np.ndarray, total: np.ndarray) -> np.ndarray:
@@ -121,14 +124,14 @@ def _claimed(graph: SurfaceGraph, of_object: np.ndarray, total: np.ndarray) -> n
     return inside[graph.nearest] if len(inside) else np.zeros(len(graph.nearest), dtype=bool)
 
 
-def usual(errors: np.ndarray) -> float:
-    """Return the median of the errors [V] of masks that have one and are not silent, ``LEAST_ERROR`` at least."""
-    heard = errors[errors <= SILENT]
-    return max(float(np.median(heard)) if len(heard) else 0.0, LEAST_ERROR)
+def median_error(errors: np.ndarray) -> float:
+    """Return the median of the errors [V] that are at most ``SILENT``; at least ``LEAST_ERROR``."""
+    counted = errors[errors <= SILENT]
+    return max(float(np.median(counted)) if len(counted) else 0.0, LEAST_ERROR)
 
 
 class _Votes:
-    """L of the module's docstring, sparse, view by view."""
+    """L of the module's docstring, sparse: per view keys [M] (Gaussian * classes + class) and light [M], or None."""
 
     def __init__(self, surfels, cameras, labels, rasterizer, settings, num_classes: int, progress) -> None:
         inputs = geometry_inputs(surfels)
@@ -144,38 +147,35 @@ class _Votes:
                 self._views.append((keys.cpu().numpy(), light.float().cpu().numpy()))
             if progress is not None:
                 progress(index + 1, len(labels))
+        shows = [view is not None and bool((view[0] % num_classes != BACKGROUND).any()) for view in self._views]
+        self.shows_object = np.array(shows, bool)
 
-    def say_from_start(self) -> np.ndarray:
-        """Return 1 for each view whose mask shows an object, else 0; [V] float64."""
-        shows = [found is not None and bool((found[0] % self._classes != BACKGROUND).any()) for found in self._views]
-        return np.array(shows, np.float64)
-
-    def sums(self, say: np.ndarray) -> np.ndarray:
+    def sums(self, weights: np.ndarray) -> np.ndarray:
         """Return S, [N, C] float64."""
         total = np.zeros(self._count * self._classes)
-        for weight, found in zip(say, self._views, strict=True):
-            if found is not None and weight > 0:
-                total[found[0]] += weight * found[1]
+        for weight, view in zip(weights, self._views, strict=True):
+            if view is not None and weight > 0:
+                total[view[0]] += weight * view[1]
         return total.reshape(self._count, self._classes)
 
     def errors(self, sums: np.ndarray) -> np.ndarray:
-        """Return e, [V] float64; NaN for a view without a mask, and 0 where neither it nor the others see an object."""
+        """Return e, [V] float64; NaN without a mask, and 0 where neither the view nor the others see an object."""
         agreed, known = sums.argmax(axis=1), sums.sum(axis=1) > 0
         errors = np.full(len(self._views), np.nan)
-        for view, found in enumerate(self._views):
-            if found is None:
+        for index, view in enumerate(self._views):
+            if view is None:
                 continue
-            gaussians, classes = found[0] // self._classes, found[0] % self._classes
+            keys, light = view
+            gaussians, classes = keys // self._classes, keys % self._classes
             of_objects = known[gaussians] & ((classes != BACKGROUND) | (agreed[gaussians] != BACKGROUND))
             wrong = of_objects & (classes != agreed[gaussians])
-            errors[view] = float(found[1][wrong].sum()) / max(float(found[1][of_objects].sum()), 1e-12)
+            errors[index] = float(light[wrong].sum()) / max(float(light[of_objects].sum()), 1e-12)
         return errors
 
-    def say(self, errors: np.ndarray) -> np.ndarray:
+    def weights(self, errors: np.ndarray) -> np.ndarray:
         """Return a, [V] float64."""
-        shows = self.say_from_start() > 0
-        say = 1.0 / (1.0 + (np.nan_to_num(errors) / usual(errors)) ** 2)
-        return np.where(shows & (np.nan_to_num(errors) <= SILENT), say, 0.0)
+        errors, median = np.nan_to_num(errors), median_error(errors)
+        return np.where(self.shows_object & (errors <= SILENT), 1.0 / (1.0 + (errors / median) ** 2), 0.0)
 
 
 def agreed_masks(
@@ -189,12 +189,12 @@ def agreed_masks(
     reach: int = 1,
     photos: Sequence[Callable[[], np.ndarray]] | None = None,
 ) -> Iterator[AgreedMask]:
-    """Yield the masks of all views; those that the others contradict are drawn from the Gaussians where they differ.
+    """Yield the masks of all views; contradicted masks are redrawn from the Gaussians where the two differ.
 
-    A given outline is finer than that of Gaussians, so that a difference counts where it is wider than 2 ``reach``
-    pixels. There a pixel becomes the class of surely decided Gaussians, or IGNORE. A silenced view, and one without a
-    mask, is drawn whole. reach: 1 at the size that was trained on, more at larger photos. photos: per view a function
-    that returns it [H, W, 3] uint8 RGB, to whose edges new outlines move; without, they stay.
+    A given outline is finer than that of Gaussians, so only differences wider than 2 ``reach`` pixels count. There a
+    pixel takes the class of the Gaussians if these are certain, else IGNORE. Masks of silenced views, and of views
+    without one, are redrawn whole. reach: 1 at the size of the training, more at larger photos. photos: per view a
+    function that returns the photo [H, W, 3] uint8 RGB; new outlines move to its edges. None: they stay.
     """
     inputs = geometry_inputs(surfels)
     ids, sure = (each.to(inputs.means.device) for each in (agreement.class_ids, agreement.sure))
@@ -208,37 +208,31 @@ def agreed_masks(
             continue
         with torch.no_grad():
             light = draw_features(rasterizer, inputs, features, camera, settings).cpu().numpy()
-        drawn, certain = _shown(light[..., :-1]), light[..., -1] > DRAWN
-        given = np.full(drawn.shape, IGNORE, np.int64) if mask is None else mask.cpu().numpy().astype(np.int64)
+        of_classes, certain = light[..., :-1], light[..., -1] > DRAWN
+        rendered = np.where(of_classes.max(axis=-1) > DRAWN, of_classes.argmax(axis=-1), IGNORE)
+        given = np.full(rendered.shape, IGNORE, np.int64) if mask is None else mask.cpu().numpy().astype(np.int64)
         if mask is None or view in whole:
-            taken = np.ones(drawn.shape, dtype=bool)
+            redrawn = np.ones(rendered.shape, dtype=bool)
         else:
-            taken = _wide((drawn != IGNORE) & (drawn != given) & (given != IGNORE), reach)
-        labelled = np.where(taken, drawn, given).astype(np.uint16)
-        if photos is not None and taken.any():
-            near = _grown(taken, 2 * reach)
+            redrawn = _wide((rendered != IGNORE) & (rendered != given) & (given != IGNORE), reach)
+        labelled = np.where(redrawn, rendered, given).astype(np.uint16)
+        if photos is not None and redrawn.any():
+            near = _grown(redrawn, 2 * reach)
             labelled = np.where(near, snap_to_edges(labelled, photos[view](), 2 * reach), labelled)
-        labelled[taken & ~certain] = IGNORE
+        labelled[redrawn & ~certain] = IGNORE
         new = torch.from_numpy(labelled.astype(np.int32))
-        doubtful = torch.from_numpy(taken & (labelled == IGNORE))
+        doubtful = torch.from_numpy(redrawn & (labelled == IGNORE))
         changed = torch.from_numpy((labelled != given) & (labelled != IGNORE))
         yield AgreedMask(new.to(inputs.means.device), changed, doubtful)
 
 
-def _shown(light: np.ndarray) -> np.ndarray:
-    """Return the class [H, W] int64 that gives more than ``DRAWN`` of a pixel's light [H, W, C], or IGNORE."""
-    return np.where(light.max(axis=-1) > DRAWN, light.argmax(axis=-1), IGNORE)
+def _wide(mask: np.ndarray, reach: int) -> np.ndarray:
+    """Return the parts of a mask [H, W] bool that are wider than 2 ``reach`` pixels."""
+    return mask & _grown(~_grown(~mask, reach), reach + 1)
 
 
-def _wide(found: np.ndarray, reach: int) -> np.ndarray:
-    """Return the parts of a mask [H, W] bool wider than 2 ``reach`` pixels, without what leads away from them."""
+def _grown(mask: np.ndarray, reach: int) -> np.ndarray:
+    """Return a mask [H, W] bool dilated by ``reach`` pixels."""
     import cv2
 
-    side = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    return found & _grown(cv2.erode(found.astype(np.uint8), side) > 0, reach + 1)
-
-
-def _grown(found: np.ndarray, reach: int) -> np.ndarray:
-    import cv2
-
-    return cv2.dilate(found.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0

@@ -1,4 +1,4 @@
-"""The torch version of the compiled ``ops.voxel_votes.VoxelVotes``: its reference, and its substitute."""
+"""The torch version of the compiled ``ops.voxel_votes.VoxelVotes``: its reference and fallback."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import itertools
 import torch
 from torch import Tensor
 
-_BITS = 21  # of each of the three voxel indices in a key
+_BITS = 21  # bits of each of the three voxel indices in a key
 _HALF = 1 << (_BITS - 1)
-_MARGIN = 8  # voxels about a point that are read too
-_PARTS = 64  # of a voxel, in interpolation weights: integers, whose sums have no order
-LOOKS = (-2, 2)  # steps along the ray to places read where votes disagree; a step is a voxel at most
+_MARGIN = 8  # voxels around a point that are read too
+_PARTS = 64  # interpolation weight of a whole voxel: integers, so that sums do not depend on their order
+LOOKS = (-2, 2)  # steps along the ray to the places read where votes disagree; a step is at most a voxel
 
 
 class TorchVotes:
@@ -33,7 +33,7 @@ class TorchVotes:
         self._voxels, voxel = torch.unique(torch.cat([empty, *keys]), return_inverse=True)
         every = torch.cat([empty, *labels])
         self._classes = int(every.max()) + 1 if len(every) else 1
-        # A pair is voxel * classes + label; those of a voxel lie together, from its `_first` on.
+        # A pair is voxel * classes + label; the pairs of a voxel are consecutive from `_first` on.
         self._pairs, self._votes = torch.unique(voxel * self._classes + every, return_counts=True)
         voxel = self._pairs // self._classes
         counts = torch.bincount(voxel, minlength=len(self._voxels))
@@ -60,7 +60,7 @@ class TorchVotes:
             moved = points[open_points] + step * steps[open_points]
             polls.append(self._poll(open_points, *self._about(moved)[:2]))
         label, share = self._count(polls, labels)
-        # the confidence is that in the pixel's own voxel, if it has votes
+        # The confidence is the share of votes in the pixel's own voxel, if it has any.
         known = (own >= 0) & (label >= 0) & (label < self._classes)
         pair = own.clamp(min=0) * self._classes + torch.where(known, label, 0)
         at = torch.searchsorted(self._pairs, pair).clamp_(max=len(self._pairs) - 1)
@@ -69,8 +69,10 @@ class TorchVotes:
         return label, torch.where(own >= 0, own_share, share)
 
     def _about(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return indices [8, P] (-1 without votes) and weights [8, P] of the voxels about points [P, 3], and the
-        index [P] of the voxel that holds each point."""
+        """Return indices [8, P] (-1 without votes) and weights [8, P] of the voxels around points [P, 3], and own [P].
+
+        own: index of the voxel that holds each point.
+        """
         corner = torch.floor(points - 0.5)
         fraction = (((points - 0.5) - corner) * _PARTS).long()
         numbers, weights = [], []
@@ -87,20 +89,20 @@ class TorchVotes:
         return torch.where(self._voxels[at] == key, at, -1)
 
     def _agree(self, voxels: Tensor) -> Tensor:
-        """Return [P] bool: one class has more than half of the votes in each of the voxels [8, P] with votes."""
+        """Return whether one class leads in all of a point's voxels [8, P] that have votes, [P] bool."""
         leaders = self._leaders[voxels.clamp(min=0)]
         least = torch.where(voxels >= 0, leaders, self._classes).amin(0)
         return (least >= 0) & (least == torch.where(voxels >= 0, leaders, -1).amax(0))
 
     def _poll(self, points: Tensor, voxels: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Return keys point * classes + label and weighted votes, [M]. points: [P]; voxels, weights: [8, P]."""
-        found = (voxels >= 0) & (weights > 0)
-        voxel = voxels[found]
+        counted = (voxels >= 0) & (weights > 0)
+        voxel = voxels[counted]
         counts = self._first[voxel + 1] - self._first[voxel]
         starts = (counts.cumsum(0) - counts).repeat_interleave(counts)
         pair = self._first[voxel].repeat_interleave(counts) + torch.arange(len(starts), device=points.device) - starts
-        point = points.expand(8, -1)[found].repeat_interleave(counts)
-        votes = weights[found].repeat_interleave(counts) * self._votes[pair]
+        point = points.expand(8, -1)[counted].repeat_interleave(counts)
+        votes = weights[counted].repeat_interleave(counts) * self._votes[pair]
         return point * self._classes + self._pairs[pair] % self._classes, votes
 
     def _count(self, polls: list[tuple[Tensor, Tensor]], labels: Tensor) -> tuple[Tensor, Tensor]:
@@ -121,7 +123,7 @@ class TorchVotes:
 
 
 def lift(depth: Tensor, to_voxels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return points [H, W, 3] in voxels, steps along their rays [H, W, 3], and a mask [H, W] of those that count."""
+    """Return points [H, W, 3] in voxels, steps along their rays [H, W, 3], and which points can vote [H, W] bool."""
     height, width = depth.shape
     x = torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5
     y = torch.arange(height, dtype=depth.dtype, device=depth.device)[:, None] + 0.5

@@ -1,4 +1,4 @@
-"""Multiview mask reprojection: all views vote on the labels of each view (method, section 2; paper 3.2; E5)."""
+"""Multiview mask reprojection: all views vote on the labels of each view (E5; method, section 2; paper 3.2)."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from beags_plugin.ops.reprojection_votes import reprojection_votes
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import each_view
 
-_CHUNK_PIXELS = 1 << 16  # source pixels projected at a time: their temporaries stay in the cache
-_DENSE_COUNTERS = 1 << 26  # most (pixel, class) pairs of a view counted in one array (256 MiB)
+_CHUNK_PIXELS = 1 << 16  # source pixels projected at a time, so that their temporaries stay in the cache
+_DENSE_COUNTERS = 1 << 26  # most (pixel, class) pairs of a view that are counted in one array (256 MiB)
 
 
 @dataclass(frozen=True)
@@ -46,26 +46,28 @@ def reproject_pairwise(
 
     depths: V x [H, W] float, world units along z; 0 where nothing is rendered. Views may differ in size.
     labels: V x [H, W] int32 class ids below ``num_classes`` or IGNORE; None for a view without a mask. ``LabelMaps``
-        stay as narrow as they are.
+        keep their narrow type.
     tau: a vote counts only if its point is visible, |z - D_i| <= tau z; ``inf`` counts all, as the paper's text says.
-    progress: called with (done, V).
+    progress: receives (done, V).
 
-    IGNORE pixels and pixels without depth do not vote; a view votes in itself too. A tie or no vote keeps the original
-    label, which is IGNORE in a view without a mask. Time grows with V^2 pixels. Memory holds depth and labels of all
-    views (5 bytes a pixel), and a count for each pixel and class of one view.
+    IGNORE pixels and pixels without depth do not vote; a view also votes for itself. A pixel with a tie or without
+    votes keeps its label, which is IGNORE in a view without a mask. Time grows with V^2 pixels. Memory holds depth and
+    labels of all views (5 bytes a pixel), and a count for each pixel and class of one view.
 
     Yields the views in order. Raises ``UserError`` for a mask of the wrong size or with ids out of range.
     """
-    check_views(depths, cameras, labels, num_classes, tau)
+    check_counts(depths, cameras, labels, tau)
+    for index, (depth, camera, mask) in enumerate(zip(depths, cameras, labels, strict=True)):
+        check_view(index, depth, camera, mask, num_classes)
     if not cameras:
         return
-    depths = list(depths)  # every view is projected into every other
-    maps, held = PixelMaps(cameras), _held(labels)
+    depths = list(depths)  # kept in memory, as every view is projected into every other
+    maps, narrow = PixelMaps(cameras), _narrow(labels)
     compiled = cuda_extension.supports(*depths)
     size = max(camera.height * camera.width for camera in cameras) * num_classes
     dense = compiled and size <= _DENSE_COUNTERS
-    threads = extension.threads()  # a view per thread at a time, each with its own counters
-    together = max(1, min(threads, 2 * _DENSE_COUNTERS // size)) if dense else 1
+    # Each thread counts one view at a time, with its own counters.
+    together = max(1, min(extension.threads(), 2 * _DENSE_COUNTERS // size)) if dense else 1
     batches = [range(i, min(i + together, len(cameras))) for i in range(0, len(cameras), together)]
 
     def votes(number: int) -> list[tuple[Tensor, Tensor]]:
@@ -74,8 +76,8 @@ def reproject_pairwise(
             return [_by_torch(depths, cameras, labels, num_classes, tau, i, maps) for i in batch]
         towards = torch.stack([torch.cat([A.flatten(1), b], dim=1) for A, b in map(maps.towards, batch)])
         own = [labels[view] for view in batch]
-        found = reprojection_votes(depths, held, own, towards.to(depths[0].dtype), batch[0], num_classes, tau, IGNORE)
-        return list(zip(*found, strict=True))
+        voted = reprojection_votes(depths, narrow, own, towards.to(depths[0].dtype), batch[0], num_classes, tau, IGNORE)
+        return list(zip(*voted, strict=True))
 
     for number, results in enumerate(each_view(len(batches), votes)):
         for i, result in zip(batches[number], results, strict=True):
@@ -84,12 +86,12 @@ def reproject_pairwise(
             yield ReprojectedMask(*result)
 
 
-def _held(labels: Sequence[Tensor | None]) -> list[Tensor | None]:
+def _narrow(labels: Sequence[Tensor | None]) -> list[Tensor | None]:
     """Return the maps in the types of the compiled op: int32, or uint8 of ``label_maps.to_compact``."""
     if not isinstance(labels, LabelMaps):
         return list(labels)
-    narrow = (labels.narrow(index) for index in range(len(labels)))
-    return [mask if mask is None or mask.dtype == torch.uint8 else to_int32(mask) for mask in narrow]
+    masks = (labels.narrow(index) for index in range(len(labels)))
+    return [mask if mask is None or mask.dtype == torch.uint8 else to_int32(mask) for mask in masks]
 
 
 def _by_torch(depths, cameras, labels, num_classes: int, tau: float, i: int, maps: PixelMaps) -> tuple[Tensor, Tensor]:
@@ -102,15 +104,8 @@ def _by_torch(depths, cameras, labels, num_classes: int, tau: float, i: int, map
     return _decide(votes, labels[i], camera)
 
 
-def check_views(depths, cameras, labels, num_classes: int, tau: float) -> None:
-    """Raise ``UserError`` for masks of the wrong size or with ids out of range, ``ValueError`` for other misfits."""
-    check_counts(depths, cameras, labels, tau)
-    for index, (depth, camera, mask) in enumerate(zip(depths, cameras, labels, strict=True)):
-        check_view(index, depth, camera, mask, num_classes)
-
-
 def check_counts(depths, cameras, labels, tau: float) -> None:
-    """Raise for unequal numbers of views or a negative tau."""
+    """Raise ``ValueError`` for unequal numbers of views, ``UserError`` for a negative tau."""
     if not len(depths) == len(cameras) == len(labels):
         raise ValueError(f"{len(depths)} depths, {len(cameras)} cameras and {len(labels)} masks do not belong together")
     if not tau >= 0:
@@ -118,7 +113,7 @@ def check_counts(depths, cameras, labels, tau: float) -> None:
 
 
 def check_view(index: int, depth: Tensor, camera: Camera, mask: Tensor | None, num_classes: int) -> None:
-    """Raise for one view as ``check_views`` does."""
+    """Raise ``UserError`` for a mask of the wrong size or with ids out of range, ``ValueError`` for such a depth."""
     size = (camera.height, camera.width)
     if tuple(depth.shape) != size:
         raise ValueError(f"depth {index} must be {list(size)}, not {list(depth.shape)}")
@@ -145,40 +140,42 @@ class PixelMaps:
         self.K = torch.stack([view.K for view in views])
         self.rotation = torch.stack([view.rotation for view in views])
         self.translation = torch.stack([view.translation for view in views])
-        # W^T K^-1: from pixels to directions in the world
+        # W^T K^-1, from pixels to directions in the world.
         self.lift = _product(self.rotation.transpose(1, 2), torch.linalg.inv(self.K))
 
     def towards(self, i: int) -> tuple[Tensor, Tensor]:
-        """Return A [V, 3, 3] and b [V, 3], float64, that project a pixel (x, y) at depth d of view v to
-        d A (x, y, 1) + b = z (x', y', 1) in view i."""
+        """Return A [V, 3, 3] and b [V, 3], float64, with which d A (x, y, 1) + b = z (x', y', 1).
+
+        (x, y) is a pixel of view v at depth d, (x', y') its place in view i at depth z.
+        """
         A = _product(_product(self.K[i], self.rotation[i]), self.lift)
         turn = _product(self.rotation[i], self.rotation.transpose(1, 2))
         moved = self.translation[i] - _product(turn, self.translation[..., None])[..., 0]
         b = _product(self.K[i], moved[..., None])[..., 0]
-        A[i], b[i] = torch.eye(3, dtype=torch.float64), 0.0  # exactly, whatever the rounding of the matrices
+        A[i], b[i] = torch.eye(3, dtype=torch.float64), 0.0  # exact, without the rounding of the products
         return A, b
 
 
 def _product(left: Tensor, right: Tensor) -> Tensor:
-    """Multiply [.., 3, 3] by [.., 3, C] in a fixed order of operations, unlike a library's product."""
+    """Multiply [.., 3, 3] by [.., 3, C]. Determinism: a fixed order of operations, unlike a library's product."""
     return sum(left[..., k, None] * right[..., k, None, :] for k in range(3))  # type: ignore[return-value]
 
 
 def landing(
     x: Tensor, y: Tensor, depth: Tensor, pixel_map: tuple[Tensor, Tensor], size: tuple[int, int], counted: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Project pixels to another view; return a mask [..] of those inside, and of these [M] the pixel index and z.
+    """Project pixels to another view; return which land inside [..], and the pixel index [M] and z [M] of these.
 
-    x, y, depth: of the pixels, centres at + 0.5, world units along z; broadcast to one shape [..].
-    pixel_map: A [3, 3] and b [3] of ``PixelMaps.towards``. size: width and height of the other view. counted: [..]
-    bool, False excludes a pixel.
+    x, y: of the pixels, centres at + 0.5. depth: world units along z. All broadcast to one shape [..]. pixel_map:
+    A [3, 3] and b [3] of ``PixelMaps.towards``. size: width and height of the other view. counted: [..] bool, False
+    excludes a pixel.
     """
     (A, b), (width, height) = (value.to(depth) for value in pixel_map), size
     hx, hy, z = (depth * (A[r, 0] * x + (A[r, 1] * y + A[r, 2])) + b[r] for r in range(3))
-    # products, for which z = 0, infinite and NaN points fail
+    # These are products, not quotients, so that points with z = 0, infinity or NaN fail the test.
     lands = counted & (z > 0) & (hx >= 0) & (hy >= 0) & (hx < width * z) & (hy < height * z)
     hx, hy, z = hx[lands], hy[lands], z[lands]
-    # the quotient may round up to the width or height
+    # The quotient may round up to the width or height.
     column, row = (hx / z).long().clamp_(max=width - 1), (hy / z).long().clamp_(max=height - 1)
     return lands, row * width + column, z
 
@@ -201,14 +198,14 @@ def _cast(votes: _Votes, depth: Tensor, mask: Tensor, target_depth: Tensor, pixe
 
 
 class _Votes:
-    """Counts per (pixel, class) of one view: one array, or sorted pairs if that is too large."""
+    """Counts per (pixel, class) of one view, in one array, or as sorted pairs if the array would be too large."""
 
     def __init__(self, num_pixels: int, num_classes: int, device: torch.device) -> None:
         self.num_pixels, self.num_classes = num_pixels, num_classes
         self.dense = num_pixels * num_classes <= _DENSE_COUNTERS
         size = num_pixels * num_classes if self.dense else 0
         self.counts = torch.zeros(size, dtype=torch.int32, device=device)
-        self.keys = torch.zeros(0, dtype=torch.int64, device=device)  # sorted; if not dense
+        self.keys = torch.zeros(0, dtype=torch.int64, device=device)  # sorted, used if not dense
 
     def add(self, pixel: Tensor, label: Tensor) -> None:
         """Add a vote for ``label`` [M] int32 at each ``pixel`` [M] int64; integer sums are deterministic."""
@@ -222,7 +219,7 @@ class _Votes:
         self.counts = torch.zeros_like(self.keys, dtype=torch.int32).scatter_add_(0, inverse, both)
 
     def winners(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return per pixel the winner's id int64, its votes, the number of classes with as many, and all votes."""
+        """Return for each pixel the winner's id int64, its votes, how many classes have as many, and all votes."""
         if self.dense:
             counts = self.counts.view(self.num_pixels, self.num_classes)
             most, winner = counts.max(dim=1)

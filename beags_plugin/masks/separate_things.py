@@ -1,8 +1,8 @@
-"""Several things out of one object: its Gaussians fall apart where nothing of it links them, and each part is a class.
+"""Split one object into things that do not touch in space, and give each a class.
 
-A network that marks what stands out tells no things apart. In space they are apart if they do not touch: Gaussians i
-and j of the object are linked if |mu_i - mu_j| <= GAP d + s_i + s_j, with the object's size d and the larger deviation
-s of a Gaussian. Connected parts that give little light are crumbs, and belong to the nearest thing.
+A network for salient objects does not tell them apart. Gaussians i and j of the object are linked if
+|mu_i - mu_j| <= GAP d + s_i + s_j, where d is the object's size and s the larger standard deviation of a Gaussian.
+Connected parts are things; parts that give little light are crumbs, and join the nearest thing.
 """
 
 from __future__ import annotations
@@ -22,34 +22,35 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import draw_features, geometry_inputs
 
 NEIGHBOURS = 24
-GAP = 0.01  # of the size of all things: a Gaussian's light reaches beyond its deviation
-LARGEST = 0.1  # of the same: a Gaussian of such a deviation is a streak, and links nothing
-THING = 0.1  # of the light that the largest part gives: less is a crumb, as in the masks of a network
-SEEN = 0.05  # of a pixel's light: a pixel of the mask with less of the things is as the nearest with more
+GAP = 0.01  # share of d that links bridge, as a Gaussian's light reaches beyond its deviation
+LARGEST = 0.1  # deviation, in d, from which on a Gaussian is a streak and links nothing
+THING = 0.1  # least light of a thing, as a share of the largest part's; parts with less are crumbs
+SEEN = 0.05  # least light of a mask's pixel from the things; pixels with less take the nearest one's thing
 
 
 @dataclass(frozen=True)
 class Things:
-    """How many things were asked for and found, and how many more there are."""
+    """Numbers of things: requested, found, and found beyond the requested number."""
 
     asked: int
     found: int
     more: int
 
     def sentence(self) -> str:
-        """Return a sentence for users where they are not as many as were asked for, else nothing."""
+        """Return a sentence for users where the numbers differ, else ""."""
         if self.found < self.asked:
-            count = "Only one thing lies" if self.found == 1 else f"Only {self.found} things lie"
-            return f"{count} apart, not {self.asked}: things that touch, or that most masks lack, take clicks."
-        more = f"{self.more} more of what stands out lies apart, and is background: ask for {self.found + self.more}."
+            count = "Only one separate thing was" if self.found == 1 else f"Only {self.found} separate things were"
+            return f"{count} found, not {self.asked}: click on things that touch, or that most masks lack."
+        more = f"{self.more} more separate things were found and became background: ask for {self.found + self.more}."
         return more if self.more else ""
 
 
 @dataclass(frozen=True)
 class Separation:
-    """Things of one object, the largest first. agreement: with the classes 1, 2, ... of the things that were found.
+    """Things of one object, the largest first.
 
-    of_more: [N] bool, Gaussians of the things that nobody asked for, which are background.
+    agreement: with the things' classes 1, 2, ... of_more: [N] bool, Gaussians of things beyond the requested number,
+    which became background.
     """
 
     agreement: Agreement
@@ -66,9 +67,9 @@ def separate(agreement: Agreement, surfels: Surfels, most: int) -> Separation:
     light = np.bincount(parts, agreement.light[mine], minlength=int(parts.max(initial=-1)) + 1)
     order = np.argsort(-light, kind="stable")
     things = order[light[order] >= THING * light.max(initial=0.0)]
-    kept = things[:most]
+    chosen = things[:most]
     of_part = np.full(len(light), -1)
-    of_part[things], of_part[kept] = BACKGROUND, np.arange(1, len(kept) + 1)
+    of_part[things], of_part[chosen] = BACKGROUND, np.arange(1, len(chosen) + 1)
     thing = of_part[parts]
     if (crumbs := thing < 0).any():
         from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
@@ -76,13 +77,13 @@ def separate(agreement: Agreement, surfels: Surfels, most: int) -> Separation:
         thing[crumbs] = thing[~crumbs][cKDTree(centres[~crumbs]).query(centres[crumbs])[1]]
     class_ids, of_more = np.zeros(len(surfels), np.int32), np.zeros(len(surfels), bool)
     class_ids[mine], of_more[mine] = thing, thing == BACKGROUND
-    found = replace(agreement, class_ids=torch.from_numpy(class_ids))
-    counts = Things(most, len(kept), len(things) - len(kept))
-    return Separation(found, counts, torch.from_numpy(of_more))
+    separated = replace(agreement, class_ids=torch.from_numpy(class_ids))
+    counts = Things(most, len(chosen), len(things) - len(chosen))
+    return Separation(separated, counts, torch.from_numpy(of_more))
 
 
 def parts_of(centres: np.ndarray, deviations: np.ndarray) -> np.ndarray:
-    """Return the number of the connected part of each of M Gaussians, [M] int64; centres [M, 3], deviations [M]."""
+    """Return the index of the connected part of each of M Gaussians, [M] int64; centres [M, 3], deviations [M]."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
@@ -109,10 +110,10 @@ def separated_labels(
     rasterizer: Rasterizer,
     settings: RasterSettings,
 ) -> Iterator[Tensor | None]:
-    """Yield the masks of all views with each pixel of the object given to the thing that is drawn there.
+    """Yield the masks of all views, in which each pixel of the object has the class of the thing rendered there.
 
-    labels: per view [H, W] int32, 1 for the object, IGNORE, or None. Pixels of the object at which no thing is drawn
-    become the nearest one's; without any in the view, IGNORE.
+    labels: per view [H, W] int32, 1 for the object, IGNORE, or None. Pixels of the object where no thing is rendered
+    take the class of the nearest one; IGNORE if the view shows none.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -126,15 +127,15 @@ def separated_labels(
             continue
         with torch.no_grad():
             light = draw_features(rasterizer, inputs, features, camera, settings).cpu().numpy()
-        given = mask.cpu().numpy().astype(np.int64)
-        wanted = (given != BACKGROUND) & (given != IGNORE)
-        drawn = light.argmax(axis=-1) + 1
-        known = wanted & (light.sum(axis=-1) > SEEN)
+        separated = mask.cpu().numpy().astype(np.int64)
+        inside = (separated != BACKGROUND) & (separated != IGNORE)
+        rendered = light.argmax(axis=-1) + 1
+        known = inside & (light.sum(axis=-1) > SEEN)
         if known.any():
             rows, columns = distance_transform_edt(~known, return_distances=False, return_indices=True)  # pyright: ignore
-            drawn = drawn[rows, columns]
-            drawn[drawn > last] = BACKGROUND
-            given[wanted] = drawn[wanted]
+            rendered = rendered[rows, columns]
+            rendered[rendered > last] = BACKGROUND
+            separated[inside] = rendered[inside]
         else:
-            given[wanted] = IGNORE
-        yield torch.from_numpy(given.astype(np.int32)).to(mask.device)
+            separated[inside] = IGNORE
+        yield torch.from_numpy(separated.astype(np.int32)).to(mask.device)

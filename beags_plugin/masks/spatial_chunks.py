@@ -1,4 +1,4 @@
-"""Chunks of space whose votes are counted one after the other, which bounds the memory of voxels."""
+"""Chunks of space, counted one after the other to bound the memory of voxels."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from beags_plugin.ops.voxel_votes import brick_sample
 
 MOST_BRICKS = 1 << 19  # bricks of 4 x 4 x 4 voxels in memory: about 0.4 GB
 _BRICK = 4
-_PART = 64  # about one brick in 64 is counted
-_PRIMES = (73856093, 19349663, 83492791)  # as in native/ops/voxel_votes.cpp
+_PART = 64  # one brick in so many is counted, approximately
+_PRIMES = (73856093, 19349663, 83492791)  # the hash of native/ops/voxel_votes.cpp
 
 
 @dataclass(frozen=True)
 class SpatialChunks:
-    """Chunks s of the points with coordinates borders[s] .. borders[s + 1] along ``axis``, in voxels.
+    """Chunks of space: chunk s holds coordinates borders[s] .. borders[s + 1] along ``axis``, in voxels.
 
-    borders: the first is -inf, the last inf. margin: farthest voxels read about a point.
+    borders: the first is -inf, the last inf. margin: distance of the farthest voxels read around a point, in voxels.
     """
 
     axis: int
@@ -35,7 +35,7 @@ class SpatialChunks:
         return len(self.borders) - 1
 
     def coordinates(self, depth: Tensor, to_voxels: Tensor) -> Tensor:
-        """Return [H, W], the points of a view along the axis; NaN without depth.
+        """Return the coordinates of a view's points along the axis, [H, W]; NaN without depth.
 
         to_voxels: [13] like ``depth``, see ``ops.voxel_votes``.
         """
@@ -43,15 +43,15 @@ class SpatialChunks:
         x = torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5
         y = torch.arange(height, dtype=depth.dtype, device=depth.device)[:, None] + 0.5
         across, down, rest = to_voxels[3 * self.axis : 3 * self.axis + 3]
-        found = (across * x + (down * y + rest)).mul_(depth).add_(to_voxels[9 + self.axis])
-        return found.masked_fill_(~(depth > 0), math.nan)
+        coordinates = (across * x + (down * y + rest)).mul_(depth).add_(to_voxels[9 + self.axis])
+        return coordinates.masked_fill_(~(depth > 0), math.nan)
 
     def inside(self, coordinates: Tensor, chunk: int) -> Tensor:
-        """Return [H, W] bool: the points of the chunk."""
+        """Return which points lie in the chunk, [H, W] bool."""
         return (coordinates >= self.borders[chunk]) & (coordinates < self.borders[chunk + 1])
 
     def about(self, coordinates: Tensor, chunk: int) -> Tensor:
-        """Return [H, W] bool: the points whose votes matter to the chunk."""
+        """Return which points cast votes that the chunk reads, [H, W] bool."""
         first, last = self.borders[chunk] - self.margin, self.borders[chunk + 1] + self.margin
         return (coordinates >= first) & (coordinates < last)
 
@@ -65,7 +65,7 @@ def divide_space(
     """Cut space along its longest axis into chunks of about ``most`` (``MOST_BRICKS``) bricks of voxels.
 
     depths: V x [H, W], read once, one view at a time. to_voxels: [V, 13] float64, see ``ops.voxel_votes``.
-    A 64th of the bricks, kept in memory for each view, estimates their number.
+    The number of bricks is estimated from a 64th of them, which is kept in memory for each view.
     """
     most = MOST_BRICKS if most is None else most
     if sum(camera.height * camera.width for camera in cameras) <= most:
@@ -74,31 +74,31 @@ def divide_space(
         (brick_sample if extension.supports(depth) else torch_brick_sample)(depth, own.to(depth), _PART)
         for depth, own in zip(depths, to_voxels, strict=True)
     ]
-    found = torch.unique(torch.cat(samples), dim=0)
-    count = -(-_PART * len(found) // most)
+    bricks = torch.unique(torch.cat(samples), dim=0)
+    count = -(-_PART * len(bricks) // most)
     if count <= 1:
         return WHOLE
-    middle = torch.quantile(found.double(), torch.tensor([0.05, 0.95], dtype=torch.float64), dim=0)
+    middle = torch.quantile(bricks.double(), torch.tensor([0.05, 0.95], dtype=torch.float64), dim=0)
     axis = int((middle[1] - middle[0]).argmax())
-    along = found[:, axis].sort().values
+    along = bricks[:, axis].sort().values
     inner = sorted({int(along[len(along) * s // count]) * _BRICK for s in range(1, count)})
     return SpatialChunks(axis, (-math.inf, *map(float, inner), math.inf), _margin(cameras))
 
 
 def torch_brick_sample(depth: Tensor, to_voxels: Tensor, part: int) -> Tensor:
-    """Return [M, 3] int64, sorted, on the CPU: about one in ``part`` of the bricks with points of a view [H, W].
+    """Return about one in ``part`` of the bricks that hold points of a view, [M, 3] int64, sorted, on the CPU.
 
-    The choice of a brick is the same in every view. to_voxels: [13] like ``depth``, see ``ops.voxel_votes``.
-    part: a power of two.
+    Every view chooses the same bricks. depth: [H, W]. to_voxels: [13] like ``depth``, see ``ops.voxel_votes``. part: a
+    power of two.
     """
     points, _, near = lift(depth, to_voxels)
     bricks = torch.floor(points[near] / _BRICK).int()
-    x, y, z = (bricks * torch.tensor(_PRIMES, dtype=torch.int32, device=bricks.device)).unbind(1)  # wraps around
+    x, y, z = (bricks * torch.tensor(_PRIMES, dtype=torch.int32, device=bricks.device)).unbind(1)  # int32 wraps around
     return torch.unique(bricks[((x ^ y ^ z) >> 8) % part == 0], dim=0).long().cpu()
 
 
 def _margin(cameras: Sequence[Camera]) -> float:
-    """Return the farthest voxels read about a point: steps along rays are longest in the corners of images."""
+    """Return ``SpatialChunks.margin``: steps along rays are longest in the corners of images."""
     longest = 1.0
     for camera in cameras:
         corners = [(x, y, 1.0) for x in (0, camera.width) for y in (0, camera.height)]

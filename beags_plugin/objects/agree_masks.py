@@ -1,4 +1,4 @@
-"""Masks that agree in space, by the Gaussians of a trained run: ``beags masks agree``."""
+"""``beags masks agree``: masks that agree in space, by the Gaussians of a trained run."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import counted, progress_bar
 from beags_plugin.views.data_options import DataOptions
 
-FOLDER = "agreed"  # beside config.yml
+FOLDER = "agreed"  # the default output, beside config.yml
 PICTURES = 6  # views in doubt.png
-IN_DOUBT, CHANGED, AS_GIVEN = 0, 128, 255  # grey values in its last column
+IN_DOUBT, CHANGED, AS_GIVEN = 0, 128, 255  # grey values in the last column of doubt.png
 LEGEND = "black: in doubt, grey: changed"
 
 
@@ -39,10 +39,10 @@ def agree_masks(
     """Write masks of all training views that agree, classes.json, report.json and doubt.png; return lines for users.
 
     config_path: config.yml of any run, trained with or without masks. options: of the data; those of reprojection are
-    not used. output: the folder; ``agreed`` beside config.yml if None. things: above 1, the one object of the masks is
-    split into so many separate things, or fewer, which are called as it is, and numbered. enlarge: masks made at the
-    run's size are written at that of the photos, and no next command is named. Raises ``UserError`` for a run or data
-    that cannot be used, and if no mask of a training view names an object.
+    not used. output: the folder; ``FOLDER`` beside config.yml if None. things: if above 1, the one object of the masks
+    is split into at most so many separate things, which get its name and a number. enlarge: write masks made at the
+    run's size at that of the photos, and name no next command. Raises ``UserError`` for a run or data that cannot be
+    used, and if no mask of a training view names an object.
     """
     run = Run(config_path, options.data)
     scene, manager = run.scene, data_to_reproject(run, options)
@@ -54,16 +54,16 @@ def agree_masks(
     if things > 1 and len(classes) != 2:
         raise UserError(
             f"the masks name {len(classes) - 1} objects ({', '.join(classes[i] for i in classes if i)}), and only one "
-            "can be split into things that lie apart: leave --objects out."
+            "can be split into separate things: leave --objects out."
         )
-    shown = CompressedMaps()
+    doubts = CompressedMaps()
 
     def pixels(view: int) -> np.ndarray:
         return (255.0 * views[view].image + 0.5).to(torch.uint8).cpu().numpy()
 
     def take(view: int, mask: AgreedMask) -> None:
         value = torch.full_like(mask.labels, AS_GIVEN, dtype=torch.uint8)
-        shown.append(value.masked_fill(mask.changed, CHANGED).masked_fill(mask.doubtful, IN_DOUBT))
+        doubts.append(value.masked_fill(mask.changed, CHANGED).masked_fill(mask.doubtful, IN_DOUBT))
 
     labels, report = agree(
         scene.surfels().detach(), [view.camera for view in views], given, known_classes(given, classes),
@@ -72,8 +72,8 @@ def agree_masks(
         [partial(pixels, view) for view in range(len(views))], take, things,
     )  # fmt: skip
     if report.things is not None:
-        called = next(name for class_id, name in classes.items() if class_id)
-        classes = {0: classes[0], **{i: f"{called} {i}" for i in range(1, report.things.found + 1)}}
+        name = next(name for class_id, name in classes.items() if class_id)
+        classes = {0: classes[0], **{i: f"{name} {i}" for i in range(1, report.things.found + 1)}}
     names, output = [view.name for view in views], output or config_path.parent / FOLDER
     with writing(output):
         for index, path in enumerate(mask_paths(manager.train_dataset.image_filenames)):
@@ -89,25 +89,24 @@ def agree_masks(
         order = [int(view) for view in np.argsort(-touched, kind="stable")[:PICTURES] if touched[view] > 0]
         pictured = []
         for view in order:
-            before = given[view]
-            before = None if before is None else before.numpy()
-            pictured.append(Changed(names[view], pixels(view), before, labels[view].numpy(), shown[view].numpy()))
+            before = None if (mask := given[view]) is None else mask.numpy()
+            pictured.append(Changed(names[view], pixels(view), before, labels[view].numpy(), doubts[view].numpy()))
         (output / "doubt.png").unlink(missing_ok=True)
         if pictured:
             before_and_after(output / "doubt.png", pictured, LEGEND)
     written = ("masks", "report.json", *(["doubt.png"] if pictured else []))
-    said = [f"{report.sentence(names)}.", *(str(output / name) for name in written)]
+    lines = [f"{report.sentence(names)}.", *(str(output / name) for name in written)]
     if report.things is not None and (sentence := report.things.sentence()):
-        said.insert(1, sentence)
-    if enlarge:  # The demo asks for this: it goes on by itself.
-        return said
+        lines.insert(1, sentence)
+    if enlarge:  # the demo goes on by itself
+        return lines
     if options.run_size and _downscale(scene) != 1.0:
-        return [*said, "These masks are smaller than the photos: to train with masks, make them without --run-size."]
-    return [*said, f"Next: {_refinement(scene, output.absolute())}"]
+        return [*lines, "These masks are smaller than the photos: to train with masks, make them without --run-size."]
+    return [*lines, f"Next: {_refinement(scene, output.absolute())}"]
 
 
 def _downscale(scene: SavedScene) -> float:
-    """Return how much larger the photos are than what the run was trained on."""
+    """Return the size of the photos over that at which the run was trained."""
     data = scene.config.data_config
     parser = cast(DataOptions, data.dataparser)
     return (parser.downscale_factor or 1.0) / data.camera_res_scale_factor

@@ -14,9 +14,15 @@ from beags_plugin.data.dataset import Dataset
 from beags_plugin.data.files import image_size, photo_names
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.labels.classes import read_classes
-from beags_plugin.masks.check.areas import Area, contradicted
 from beags_plugin.masks.check.consistency import Agreement
-from beags_plugin.masks.check.contradictions import Contradiction, contradictions, issues_of, settle
+from beags_plugin.masks.check.contradictions import (
+    Area,
+    Contradiction,
+    contradicted,
+    contradictions,
+    issues_of,
+    settle,
+)
 from beags_plugin.masks.check.disagreement import views_against_others
 from beags_plugin.masks.check.files import FEW_VIEWS, MOST_IDS, Coverage, MaskFiles, check_files
 from beags_plugin.masks.check.issues import LEVELS, Issue, ordered, percent
@@ -32,16 +38,16 @@ from beags_plugin.views.scene_data import SceneData
 from beags_plugin.views.tracks import Tracks, features_of
 
 MOST_PICTURES = 6  # views in contradicted.png
-MOST_OBJECTS = 40  # that are printed
+MOST_OBJECTS = 40  # objects that are printed
 
 
 @dataclass
 class Report:
-    """The findings.
+    """What the check found.
 
     names: class id to name. trained: False for held-out views. contradictions: views whose masks the others contradict,
-    the worst first, at the points that views saw, then with a trained run at its depths, in ``areas``. compared: a
-    sentence about these points. pointed, framed: the worst views of both, for ``contradicted_picture``.
+    the worst first, at tracked points, then, with a trained run, at its depths, in ``areas``. compared: a sentence on
+    the tracked points. pointed, framed: the worst views at points and in areas, for ``contradicted_picture``.
     """
 
     data: Path
@@ -71,14 +77,14 @@ class Report:
         return any(issue.level == "error" for issue in self.issues)
 
     def add(self, found: Sequence[Contradiction], masks: int) -> None:
-        """Take up contradictions of one kind, except about objects that most views lack."""
+        """Add contradictions of one kind, except those of objects that most views lack. masks: number of all."""
         absent = {class_id for issue in self.issues if issue.kind == "absent" for class_id in issue.objects}
-        found = [one for one in found if one.class_id not in absent]
-        self.contradictions += found
-        self.issues = ordered([*self.issues, *issues_of(found, self.names, masks)])
+        added = [one for one in found if one.class_id not in absent]
+        self.contradictions += added
+        self.issues = ordered([*self.issues, *issues_of(added, self.names, masks)])
 
     def objects(self) -> list[str]:
-        """Return a line for each object: in how many training views it is, and its share of their pixels."""
+        """Return a line for each object: the number of training views that show it, and its share of their pixels."""
         coverage, lines = self.coverage, []
         usable = np.asarray(self.trained) & coverage.usable
         for column, class_id in enumerate(coverage.ids):
@@ -92,7 +98,7 @@ class Report:
         return lines
 
     def lines(self) -> list[str]:
-        """Return what people read: the objects, the issues with what they cost, the summary."""
+        """Return the lines of the printed report: objects, issues with their costs, summary."""
         objects = self.objects()
         if len(objects) > MOST_OBJECTS:
             objects[MOST_OBJECTS:] = [f"and {len(objects) - MOST_OBJECTS} more objects"]
@@ -117,7 +123,7 @@ class Report:
 
 
 def check(parser: DataOptions, few_views: int = FEW_VIEWS, run: Path | None = None) -> Report:
-    """Check the masks of a scene, with a trained run (its config.yml) also at its depths, if nothing stops training."""
+    """Check the masks of a scene; if nothing stops training, also at the depths of a run (its config.yml)."""
     report = check_scene(parser, few_views)
     if run is not None and not report.stops:
         options = ReprojectionOptions(method="voxel", run_size=True, parser=parser)
@@ -126,9 +132,9 @@ def check(parser: DataOptions, few_views: int = FEW_VIEWS, run: Path | None = No
 
 
 def check_scene(config: DataOptions, few_views: int = FEW_VIEWS) -> Report:
-    """Check the masks of the scene that ``config`` names, at the size of the photographs.
+    """Check the masks of the scene that ``config`` names, at the size of the photos.
 
-    Raises ``UserError`` only where poses or photos are bad.
+    Raises ``UserError`` only for bad poses or photos.
     """
     config = replace(config, downscale_factor=1.0)
     if few_views < 1:
@@ -145,8 +151,8 @@ def check_scene(config: DataOptions, few_views: int = FEW_VIEWS) -> Report:
                 "note",
                 "not compared",
                 f"the masks hold {len(coverage.ids)} ids, so views are not compared: more than {MOST_IDS} take too "
-                "much memory; drop ids that are in few views.",
-                "ids exchanged between views are not looked for",
+                "much memory; remove ids that are in few views.",
+                "the check cannot find ids exchanged between views",
             )
         )
     elif coverage.usable.sum() > 3 and len(coverage.ids) > 1:
@@ -169,7 +175,7 @@ def _files(config: DataOptions) -> tuple[Dataset, PosedViews, MaskFiles]:
     masks, folder, kind = parser.mask_files(scene, views)
     parser.check_folder(folder)
     trained = set(parser.views_of_split(views, "train"))
-    parser.views_of_split(views, "val")  # without which training stops
+    parser.views_of_split(views, "val")  # raises if there is none, as training would
     names_file = scene.root / config.classes_path
     names = read_classes(names_file) if names_file.is_file() else scene.class_names
     files = MaskFiles(
@@ -188,12 +194,12 @@ def _files(config: DataOptions) -> tuple[Dataset, PosedViews, MaskFiles]:
 
 
 def _add_points(report: Report, files: MaskFiles, views: PosedViews, tracks: Tracks, seen: Agreement) -> None:
-    """Add what the views that saw the same points contradict each other about."""
+    """Add the contradictions at points that several views saw."""
     report.compared = (
         f"Views were compared at {len(seen.labels)} points of the COLMAP model, each in the views that saw it."
         if len(seen.labels)
-        else "No COLMAP model says which views saw which points: parts that masks lack or take in are looked for with "
-        "--load-config only."
+        else "No COLMAP model says which views saw which points, so parts that masks leave out or take in are found "
+        "with --load-config only."
     )
     ids = report.coverage.ids
     report.add(settle(seen, report.stems, ids), int(report.coverage.usable.sum()))
@@ -202,7 +208,7 @@ def _add_points(report: Report, files: MaskFiles, views: PosedViews, tracks: Tra
 
 
 def add_areas(report: Report, run: ReprojectedRun) -> None:
-    """Add what the other views contradict at the depths of a trained run."""
+    """Add the contradictions between views at the depths of a trained run."""
     ids = sorted(run.classes)
     right, missing, extra = np.zeros((3, len(run.names), len(ids)), np.int64)
     for index, name in enumerate(run.names):
@@ -215,15 +221,15 @@ def add_areas(report: Report, run: ReprojectedRun) -> None:
             extra[index, ids.index(area.given)] += area.pixels
             report.areas.append(area)
     report.areas.sort(key=lambda area: -area.pixels)
-    found = contradictions(right, missing, extra, run.names, ids, "pixels")
-    report.add(found, sum(mask is not None for mask in run.given.stored))
+    at_depths = contradictions(right, missing, extra, run.names, ids, "pixels")
+    report.add(at_depths, sum(mask is not None for mask in run.given.stored))
     for view in list(dict.fromkeys(one.view for one in report.contradictions if one.of == "pixels"))[:MOST_PICTURES]:
         boxes = [area.box for area in report.areas if area.view == view]
         report.framed.append((run.changed(run.names.index(view)), boxes))
 
 
 def write_report(report: Report, output: Path) -> list[Path]:
-    """Write report.json, with objects coverage.png, with contradictions contradicted.png; return their paths."""
+    """Write report.json, coverage.png if there are objects, and contradicted.png; return the paths."""
     coverage = report.coverage
     share = coverage.pixels / np.maximum(coverage.size, 1)[:, None]
     written = [output / "report.json"]
@@ -237,20 +243,19 @@ def write_report(report: Report, output: Path) -> list[Path]:
 
 
 def write_contradictions(report: Report, output: Path) -> list[Path]:
-    """Write contradicted.png, the worst views, if there are any; return its path."""
+    """Write the worst views to contradicted.png, if there are any; return its path."""
     picture = output / "contradicted.png"
     if not report.pointed and not report.framed:
-        picture.unlink(missing_ok=True)  # of other masks
+        picture.unlink(missing_ok=True)  # it would show former masks
         return []
     contradicted_picture(picture, report.pointed, report.framed)
     return [picture]
 
 
 def options_beside(run: Path | None, data: Path | None, **given: Any) -> DataOptions:
-    """Return the data parser's options of a run, or the usual ones without any, replaced by those given that are not
-    None.
+    """Return the data options of a run, or the default ones without a run, with those ``given`` that are not None.
 
-    run: config.yml. data: folder of the scene, that of the run if None.
+    run: config.yml. data: folder of the scene; that of the run if None.
     """
     config = DataOptions()
     if run is not None:
@@ -262,5 +267,5 @@ def options_beside(run: Path | None, data: Path | None, **given: Any) -> DataOpt
 
 
 def data_options(data: Path, layout: str = "auto", images_path: Path | None = None, **given: Any) -> DataOptions:
-    """Return the data parser's options of a scene without a run; given: as of ``options_beside``."""
+    """Return ``options_beside`` of a scene without a run."""
     return options_beside(None, data, layout=layout, images_path=images_path, **given)

@@ -1,4 +1,4 @@
-"""Labels of points in all views of a scene: of any points in space, and of those that views are known to have seen."""
+"""Labels of points in all views of a scene: of points in space, and of points tracked by a COLMAP model."""
 
 from __future__ import annotations
 
@@ -22,15 +22,14 @@ from beags_plugin.views.poses import PosedViews
 from beags_plugin.views.seed_points import random_points, starting_points
 from beags_plugin.views.tracks import Tracks
 
-RANDOM_POINTS = 50_000  # beside the seed points: an object that has none of these has some of them in it
+RANDOM_POINTS = 50_000  # random points, for objects without seed points
 MOST_SEED_POINTS = 100_000
-MOST_COUNTS = 30_000_000  # points times classes, or times views, that are held at a time
+MOST_COUNTS = 30_000_000  # most points times classes, or times views, in memory
 
 
 def points_in_space(scene: Dataset, views: PosedViews, config: DataOptions) -> np.ndarray:
     """Return [P, 3] float64 in the cameras' world: seed points, and random points where the cameras look."""
-    found = starting_points(scene, views, config.num_random_points)
-    seeds = found["points3D_xyz"].double().numpy()
+    seeds = starting_points(scene, views, config.num_random_points)["points3D_xyz"].double().numpy()
     step = -(-len(seeds) // MOST_SEED_POINTS)
     cameras = [camera_from_nerfstudio(views.cameras, index) for index in range(len(views.images))]
     random, _ = random_points(cameras, RANDOM_POINTS)
@@ -38,15 +37,18 @@ def points_in_space(scene: Dataset, views: PosedViews, config: DataOptions) -> n
 
 
 def tracks_of(features: Tracks, classes: int) -> Tracks:
-    """Return the points of a COLMAP model that each view saw, as rows of a table."""
+    """Return the features of each view that have a point, with the point's row in a table instead of its id.
+
+    Points are thinned so that the table has at most ``MOST_COUNTS`` entries. classes: their number.
+    """
     ids = np.unique(np.concatenate([points[points >= 0] for points, _ in features] or [np.zeros(0, np.int64)]))
     ids = ids[:: max(1, -(-len(ids) * max(classes, len(features)) // MOST_COUNTS))]
-    kept = [np.isin(points, ids) for points, _ in features]
-    return [(np.searchsorted(ids, points[k]), places[k]) for (points, places), k in zip(features, kept, strict=True)]
+    known = [np.isin(points, ids) for points, _ in features]
+    return [(np.searchsorted(ids, points[k]), places[k]) for (points, places), k in zip(features, known, strict=True)]
 
 
 def turned(features: Tracks, files: MaskFiles, coverage: Coverage) -> Issue | None:
-    """Return the issue that the objects seem to have turned before a room that stands, whose poses the scene has."""
+    """Return an issue if the objects seem to have turned while the room, from which the poses come, stayed."""
 
     def photos() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         for view in np.flatnonzero(coverage.usable).tolist():
@@ -54,7 +56,7 @@ def turned(features: Tracks, files: MaskFiles, coverage: Coverage) -> Issue | No
             if len(ids) and (mask := files.read(view)) is not None:
                 yield places, ids >= 0, mask
 
-    if not any((ids < 0).any() for ids, _ in features):  # a model that keeps no others
+    if not any((ids < 0).any() for ids, _ in features):  # the model stores only features with points
         return None
     inside, around, count = shares_explained(photos())
     if not seem_turned(inside, around, count):
@@ -71,7 +73,7 @@ def turned(features: Tracks, files: MaskFiles, coverage: Coverage) -> Issue | No
 def agreements(
     files: MaskFiles, coverage: Coverage, views: PosedViews, points: np.ndarray, tracks: Tracks
 ) -> tuple[Agreement, Agreement]:
-    """Return the agreement at points that any view may show, and at those of ``tracks`` in the views that saw them."""
+    """Return the agreement at points in space, and at those of ``tracks`` in the views that saw them."""
     classes = len(coverage.ids)
     points = points[:: -(-len(points) * classes // MOST_COUNTS)]
     labels = np.full((len(points), len(files.stems)), -1, np.int16)
@@ -93,7 +95,7 @@ def agreements(
 
 
 def pointed(files: MaskFiles, views: PosedViews, view: int, tracks: Tracks, seen: Agreement, ids: list[int]) -> Pointed:
-    """Return a view with the points that the other views label otherwise."""
+    """Return a view with the points that the other views label differently."""
     points, others = seen.against_others(view)
     wrong = others != seen.labels[points, view]
     places = dict(zip(tracks[view][0].tolist(), tracks[view][1], strict=True))

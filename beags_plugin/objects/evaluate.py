@@ -1,4 +1,4 @@
-"""Evaluation of runs on disk: their held-out views with ground truth, before and after refinement."""
+"""Evaluation of runs on disk on held-out views with ground truth, before and after refinement."""
 
 from __future__ import annotations
 
@@ -25,28 +25,25 @@ from beags_plugin.views.held_out_views import HeldOutViews
 
 Progress = Callable[[int, int], None]
 
-_PLAIN_NAMES = ("scene", "turned")  # beags demo calls its folders so.
+_PLAIN_NAMES = ("scene", "turned")  # folders of every beags demo
 
 
-def evaluate_run(
-    config_path: Path, protocol: Protocol | None = None, *, name: str = "", progress: Progress | None = None
-) -> RunMetrics:
-    """Score a trained run on the held-out views of its data, before refinement (if it has kept that) and after.
+def evaluate_run(config_path: Path, protocol: Protocol | None = None) -> RunMetrics:
+    """Score a trained run on the held-out views of its data, after refinement and, if it has saved that state, before.
 
-    config_path: config.yml of a run. protocol: the choices behind the figures. name: of the scene in tables; that of
-    the data folder if empty. progress: receives (done, total) views. Raises ``UserError`` for a run, data or a protocol
-    that cannot be used.
+    config_path: config.yml of a run. protocol: definitions of the metrics. Raises ``UserError`` for a run, data or a
+    protocol that cannot be used.
     """
-    return EvaluatedRun(config_path, name).metrics(protocol, progress)
+    return EvaluatedRun(config_path).metrics(protocol)
 
 
 class EvaluatedRun:
     """A run on disk with its held-out views, which are read when first used.
 
-    name: of the scene in tables. data: if not where they were. stages: "before" and "after", or "after" alone, to the
-    saved scenes. complete: False for a run of ``beags extract``, which holds a part of a scene. objects_alone: whether
-    it was trained on the objects' pixels alone. colors_fitted: whether it has learned exposures of photos. classes: id
-    to name of the classes that can be scored.
+    name: of the scene in tables. data: folder of the scene if it has moved. stages: "before" and "after", or "after"
+    alone, to the saved scenes. complete: False for a run of ``beags extract``, which holds a part of a scene.
+    objects_alone: whether it was trained on the objects' pixels alone. colors_fitted: whether it has learned exposures
+    of photos. classes: id to name of the classes that can be scored.
     """
 
     def __init__(self, config_path: Path, name: str = "", data: Path | None = None) -> None:
@@ -69,28 +66,28 @@ class EvaluatedRun:
 
     @cached_property
     def views(self) -> HeldOutViews:
-        """Return the held-out views; raises ``UserError`` if the run's data cannot be read."""
+        """Return the held-out views; raise ``UserError`` if the run's data cannot be read."""
         return HeldOutViews(self.run.views("test"), self.classes, fixed_background(self.run.config.model_config))
 
     def shown(self) -> list[Tensor]:
-        """Return which pixels of each held-out view training photos show, by the depth of the first stage.
+        """Return the pixels of each held-out view that training photos show, by the depth of the first stage.
 
-        One mask for all stages, so that their figures are of the same pixels.
+        All stages share these masks, so that their figures cover the same pixels.
         """
         first = next(iter(self.stages.values())).surfels()
         held_out, training = self.views.cameras("eval"), self.views.cameras("train")
         return shown_pixels(first, self.rasterizer, self.settings, held_out, training)
 
     def metrics(self, protocol: Protocol | None = None, progress: Progress | None = None) -> RunMetrics:
-        """Return the figures of all stages; arguments as of ``evaluate_run``."""
+        """Return the figures of all stages. progress: receives (done, total) views."""
         protocol = protocol or Protocol()
         protocol.check()
-        shown = self.shown() if self.complete and not self.objects_alone else None
-        found: dict[Stage, SceneMetrics] = {}
+        observed = self.shown() if self.complete and not self.objects_alone else None
+        figures: dict[Stage, SceneMetrics] = {}
         total = len(self.views) * len(self.stages)
         for stage, scene in self.stages.items():
-            former = len(found) * len(self.views)
-            found[stage] = evaluate_scene(
+            former = len(figures) * len(self.views)
+            figures[stage] = evaluate_scene(
                 scene.surfels(),
                 scene.members if scene.assigned else None,
                 self.rasterizer,
@@ -102,7 +99,7 @@ class EvaluatedRun:
                 objects_alone=self.objects_alone,
                 colors_fitted=self.colors_fitted,
                 background=self.views.background,
-                shown=shown,
+                shown=observed,
                 progress=None if progress is None else lambda done, _, former=former: progress(former + done, total),
             )
         return RunMetrics(
@@ -110,13 +107,13 @@ class EvaluatedRun:
             config=str(self.config_path.absolute()),
             protocol=protocol,
             classes=self.classes,
-            before=found.get("before"),
-            after=found["after"],
-            notes=tuple(self._notes(found["after"])),
+            before=figures.get("before"),
+            after=figures["after"],
+            notes=tuple(self._notes(figures["after"])),
         )
 
     def worst(self, metrics: RunMetrics, count: int, progress: Progress | None = None) -> list[WorstMask]:
-        """Render the ``count`` worst masks of each kind; metrics: of this run; progress: receives (done, total)."""
+        """Render the ``count`` worst masks of each kind. metrics: of this run. progress: receives (done, total)."""
         scenes: dict[Stage, tuple[Surfels, Membership]] = {
             stage: (scene.surfels(), scene.members) for stage, scene in self.stages.items() if scene.assigned
         }
@@ -140,7 +137,7 @@ class EvaluatedRun:
         elif self.objects_alone:
             yield "This run was trained on the objects' pixels alone, so only these are scored."
         elif "before" not in self.stages:
-            yield "This run has kept no state before refinement, so there is nothing to compare with."
+            yield "This run has no saved state from before refinement, so there is nothing to compare with."
         if self.views.stray_truth is not None:
             yield self.views.stray_truth
         if trained_on := self.views.trained_on():
@@ -148,7 +145,7 @@ class EvaluatedRun:
 
 
 def scene_name(config: RunConfig) -> str:
-    """Return the name of the folder of the run's data; of the one above, where it is called as every scene could be."""
+    """Return the name of the folder of the run's data; that of its parent if it has one of ``_PLAIN_NAMES``."""
     folder = config.data_path.absolute()
     folder = folder.parent if folder.suffix == ".json" else folder
     return folder.parent.name if folder.name in _PLAIN_NAMES and folder.parent.name else folder.name

@@ -1,4 +1,4 @@
-"""Export of runs: files for other programs, of each object and of the background."""
+"""Export runs: files for other programs, of each object and of the background."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from beags_plugin.export import EXPORTERS
 from beags_plugin.export.base import Exporter, make_exporter
 from beags_plugin.export.pose_options import PoseOptions
 from beags_plugin.labels.class_ids import BACKGROUND
-from beags_plugin.objects.export_job import ExportJob, Progress, Shown, Steps
+from beags_plugin.objects.clean import cleaner_of
+from beags_plugin.objects.export_job import ExportJob, Progress, Steps
 from beags_plugin.objects.exported import Exported, ExportedFile
 from beags_plugin.objects.extract import (
     empty_objects,
@@ -27,6 +28,7 @@ from beags_plugin.objects.extract import (
     said_of_empty,
 )
 from beags_plugin.objects.pose import metres_per_unit
+from beags_plugin.objects.shown import Shown
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.runs.run import Run
 from beags_plugin.splat_io.far_worlds import local_origin, said_of_far, unlist, write_origin
@@ -40,7 +42,7 @@ from beags_plugin.system.reading.text import load_json
 from beags_plugin.system.whole_files import remove_unfinished
 
 MANIFEST = "manifest.json"
-_LEFT = 10.0  # seconds without a write after which an unfinished file is left over, not another export's
+_LEFT = 10.0  # seconds without a write after which an unfinished file counts as abandoned
 WHOLE = "whole scene"  # the name of the file that holds all Gaussians
 
 
@@ -62,23 +64,23 @@ def export_run(
 ) -> list[Exported]:
     """Write files of objects of a run.
 
-    config_path: config.yml of a refined (or assigned) run. objects: names; or everything: all that have Gaussians, then
-    the emptied background, which gets no mesh, and a manifest. whole: the whole scene too, in one file; alone it needs
-    no classes. formats: names of exporters. placement: "world", the frame of the input poses (the run's own
-    if it has not kept how that was normalised), or "object", the same centred on each object. output: folder;
-    ``exports/`` in the run by default. options: format to its exporter's options. progress: receives (done, total)
-    files, and rendered views of the meshes among them. data: if not where they were. keep_all: keep Gaussians too that
-    do not belong to their object (``cleaning.clean``); the background and the whole scene are kept as they are. pose:
-    where objects stand and how large they are. closing: close objects where no photo shows them, by the surface that
-    these options lead to; the background and the whole scene are not closed. say: receives a sentence on objects
-    without Gaussians, if everything is asked for. Raises ``UserError`` for a mistake, before anything is written.
+    config_path: config.yml of a refined (or assigned) run. objects: names. everything: export all objects that have
+    Gaussians, then the background without them, which gets no mesh, and a manifest. whole: also export the whole scene
+    in one file; alone, it needs no classes. formats: names of exporters. placement: "world", the frame of the input
+    poses (the run's own if it has not saved how they were normalised), or "object", the same centred on each object.
+    output: folder; ``exports/`` in the run by default. options: format to its exporter's options. progress: receives
+    (done, total) files and views that meshes render. data: folder of the scene if it has moved. keep_all: also keep
+    Gaussians that do not belong to their object (``cleaning.clean``); the background and the whole scene are never
+    cleaned. pose: where objects stand and how large they are. closing: options of the surface by which objects are
+    closed where no photo shows them; the background and the whole scene are never closed. say: receives a sentence on
+    objects without Gaussians, with ``everything``. Raises ``UserError`` for a mistake, before anything is written.
     """
     run, folder, pose = Run(config_path, data), output or config_path.parent / "exports", pose or PoseOptions()
     check_placement(placement)
     if pose.centre and placement == "object":
         raise UserError("--centre puts the origin under objects, --frame object into their middle: leave one out.")
     exporters = {name: make_exporter(name, **(options or {}).get(name, {})) for name in formats}
-    # Quick formats first: splats, then what renders views, then meshes with textures from photos.
+    # Fast formats come first: splats, then formats that render views, then meshes with textures from photos.
     exporters = dict(sorted(exporters.items(), key=lambda named: (named[1].needs_photos, named[1].needs_views)))
     if not exporters:
         raise UserError("no format is named: name one with --format.")
@@ -100,14 +102,14 @@ def export_run(
     objects_first = sorted(present, key=lambda name: present[name] == BACKGROUND)
     names = objects_first if everything else list(dict.fromkeys(objects))
     whole_title = file_name(WHOLE)
-    titles = folder_names(scene.classes, [whole_title])  # an object may be called so too
+    titles = folder_names(scene.classes, [whole_title])  # an object may have that name too
     metres = None
     if (length := pose.length()) is not None:
         metres = metres_per_unit(length, run, frame)
     origin = local_origin(*transform) if transform is not None else None
     posed = placement == "object" or pose != PoseOptions()
     shown = Shown(run)
-    cleaner = None if keep_all or not any(map(present.get, names)) else shown.cleaner()
+    cleaner = None if keep_all or not any(map(present.get, names)) else cleaner_of(shown)
     job = ExportJob(
         scene, exporters, frame, metres, placement == "object", pose, views, everything, cleaner, shown, closing,
         None if origin is None else frame.centred(origin), None if posed else origin,
@@ -144,7 +146,7 @@ def export_run(
 
 
 def _far(folder: Path, origin: Tensor, files: Sequence[ExportedFile]) -> str:
-    """Say where files lie that were made about an origin, beside them and in a sentence."""
+    """Write the origin beside the files made around it, and return a sentence on it."""
     others = [file.path.name for file in files if file.path is not None and "origin" in file.facts]
     if others:
         write_origin(folder, origin, others)
@@ -152,9 +154,9 @@ def _far(folder: Path, origin: Tensor, files: Sequence[ExportedFile]) -> str:
 
 
 def _clear_up(folder: Path, names: Set[str] | None) -> None:
-    """Remove what a killed export left half written in a folder, and a manifest that is about to be wrong.
+    """Remove unfinished files of a killed export from a folder, and a manifest that is about to become wrong.
 
-    names: of the files that will be written; None: those of all objects.
+    names: of the files that will be written; None for those of all objects.
     """
     manifest = folder / MANIFEST
     with writing(folder):
@@ -164,16 +166,16 @@ def _clear_up(folder: Path, names: Set[str] | None) -> None:
 
 
 def _ends() -> list[str]:
-    """Return how the names of all formats end, but those of other packages that cannot be loaded."""
-    found = []
+    """Return the endings of all formats, except those of other packages that cannot be loaded."""
+    ends = []
     for name in EXPORTERS.names():
         with suppress(UserError):
-            found.append(f".{EXPORTERS.get(name).suffix}")
-    return found
+            ends.append(f".{EXPORTERS.get(name).suffix}")
+    return ends
 
 
 def _listed(manifest: Path) -> set[str]:
-    """Return the files that a manifest lists; none if it is not there, or not ours."""
+    """Return the files that a manifest lists; empty if it does not exist, or is another program's."""
     try:
         return {file["path"] for one in load_json(manifest)["objects"] for file in one["files"]}
     except (OSError, ValueError, KeyError, TypeError):
@@ -190,12 +192,12 @@ def export_shown(
     progress: Progress = lambda done, total: None,
     scale_by: str = "",
 ) -> Path:
-    """Write Gaussians that a viewer shows into ``exports/`` of the run, without replacing a file; return the path.
+    """Write the Gaussians that a viewer shows to a new file in ``exports/`` of the run; return its path.
 
-    config_path: config.yml of the run. surfels: M of its frame. class_ids: [M] int32. title: file name before the
-    suffix. settings: depth range of the scene. progress: receives (done, total) rendered views of a mesh. scale_by: see
-    ``PoseOptions``. Raises ``UserError`` if nothing is shown, for an unknown format, one whose files have a size where
-    that is not known, or a file that cannot be written.
+    config_path: config.yml of the run. surfels: M Gaussians in its frame. class_ids: [M] int32. title: file name before
+    the suffix. settings: depth range of the scene. progress: receives (done, total) rendered views of a mesh. scale_by:
+    see ``PoseOptions``. Raises ``UserError`` if nothing is shown, for an unknown format, for a format in millimetres if
+    the scene's size is unknown, and for a file that cannot be written.
     """
     exporter, pose = make_exporter(format_name), PoseOptions(scale_by=scale_by)
     _check_size(format_name, exporter, pose, "in the tab Size.")
@@ -206,7 +208,7 @@ def export_shown(
     if origin is not None:
         frame = frame.centred(origin)
     if (length := pose.length()) is not None:
-        given = frame if origin is None else frame.centred(-origin)  # points are told in the world's coordinates
+        given = frame if origin is None else frame.centred(-origin)  # points are given in the world's coordinates
         frame = frame.scaled(metres_per_unit(length, run, given))
     views = None
     if exporter.needs_views:
@@ -224,7 +226,7 @@ def export_shown(
 
 
 def _check_size(name: str, exporter: Exporter, pose: PoseOptions, how: str) -> None:
-    """Raise ``UserError`` if a format's files have a size and the scene has none; how: a length is given."""
+    """Raise ``UserError`` if a format is in millimetres and the scene's size is unknown. how: to give a length."""
     if exporter.needs_metres and not pose.scale_by:
         raise UserError(
             f"a .{name} file is in millimetres, but the size of the scene is not known: give a length {how}"
@@ -232,7 +234,7 @@ def _check_size(name: str, exporter: Exporter, pose: PoseOptions, how: str) -> N
 
 
 def _free_path(folder: Path, title: str, suffix: str) -> Path:
-    """Return a path named after ``title`` that is free, with a number if need be."""
+    """Return a free path named ``title``, with a number if needed."""
     stem = file_name(title)
     names = chain([stem], (f"{stem}_{number}" for number in count(2)))
     return next(path for name in names if not (path := folder / f"{name}.{suffix}").exists())

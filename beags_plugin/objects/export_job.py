@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import torch
 
-from beags_plugin.cleaning.silhouettes import MaskedViews
 from beags_plugin.core.select import select_class
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export.base import Exporter
@@ -19,10 +17,8 @@ from beags_plugin.objects.clean import Cleaner
 from beags_plugin.objects.exported import Exported, ExportedFile
 from beags_plugin.objects.photos import photos_of
 from beags_plugin.objects.pose import plane_under
-from beags_plugin.objects.shown import ShownScene, Unshown, shown_scene
-from beags_plugin.runs.belonging import Belonging
+from beags_plugin.objects.shown import Shown
 from beags_plugin.runs.read import SavedScene
-from beags_plugin.runs.run import Run
 from beags_plugin.surfaces.closing_surfels import with_closing
 from beags_plugin.surfaces.frames import Frame, bounding_box
 from beags_plugin.surfaces.ground_plane import turn_to_z
@@ -33,9 +29,9 @@ Progress = Callable[[int, int], None]
 
 
 class Steps:
-    """Reports the progress of an export: a step for each piece, and before it one for each view that it renders.
+    """Reports the progress of an export: a step for each piece, after one for each view that it renders.
 
-    of_a_piece: steps of each piece of an item: of its closing, if any, and of its files.
+    of_a_piece: steps of each piece of an item: of its closing, if any, and of each file.
     """
 
     def __init__(self, of_a_piece: Sequence[int], items: int, report: Progress) -> None:
@@ -45,52 +41,25 @@ class Steps:
         self.on_render(0)
 
     def on_render(self, views: int) -> None:
-        """Report the rendered views of the present piece."""
+        """Report the rendered views of the current piece."""
         self._report(sum(self._of_pieces[: self._piece]) + views, sum(self._of_pieces))
 
     def finish(self) -> None:
-        """Report the present piece as done."""
+        """Report the current piece as done."""
         self._piece += 1
         self.on_render(0)
-
-
-class Shown:
-    """What the training views of a run show, read when it is first asked for."""
-
-    def __init__(self, run: Run) -> None:
-        self._run = run
-
-    @cached_property
-    def _found(self) -> ShownScene | str:
-        try:
-            return shown_scene(self._run)
-        except Unshown as doubt:
-            return str(doubt)
-
-    def scene(self) -> tuple[ShownScene | None, str]:
-        """Return it, or None and why it cannot be had."""
-        return (None, self._found) if isinstance(self._found, str) else (self._found, "")
-
-    def cleaner(self) -> Cleaner:
-        """Return what decides which Gaussians belong to objects."""
-
-        def views() -> tuple[MaskedViews | None, str]:
-            found, doubt = self.scene()
-            return (None if found is None else found.views), doubt
-
-        return Cleaner(views, Belonging(self._run.scene, self._run.folder))
 
 
 @dataclass(frozen=True)
 class ExportJob:
     """The common settings of all items of an export.
 
-    world: the input's frame. local: the same about an origin near the scene, in which files are made where the world is
-    far from 0. shift: [3] float64, that origin, if what can hold double precision shall be in the world's coordinates.
-    metres: of a unit of it, None if files keep its unit. centred: the origin is the middle of
-    each item. views: in the run's frame. tolerant: leave out a format for which an item has nothing. cleaner: decides
-    what belongs to an object; None: all. closing: how the surfaces of objects are made that tell what no photo shows
-    and shall be closed; None: nothing is closed.
+    world: the input's frame. metres: metres in a unit of it, or None if files keep its unit. centred: whether the
+    origin is the middle of each item. views: in the run's frame. tolerant: whether to leave out a format for which an
+    item has nothing. cleaner: decides what belongs to an object; None for all. closing: options of the surface by which
+    objects are closed where no photo shows them; None to close nothing. local: the world's frame around an origin near
+    the scene, in which files are made if the world is far from 0. shift: [3] float64, that origin, if files that can
+    hold double precision are to have the world's coordinates.
     """
 
     scene: SavedScene
@@ -117,7 +86,7 @@ class ExportJob:
         return self.closing is not None and any(exporter.holds_gaussians for exporter in self.exporters.values())
 
     def export(self, name: str, class_id: int | None, stem: Path, steps: Steps) -> Exported:
-        """Write all files of one class (None: of the whole scene), called ``stem`` and their suffixes."""
+        """Write all files of one class (None: of the whole scene), named ``stem`` and a suffix."""
         class_ids, chosen, left_out = self.scene.members.class_ids, self.scene.surfels(), None
         if class_id is not None:
             chosen, index = select_class(chosen, self.scene.members, class_id)
@@ -161,7 +130,7 @@ class ExportJob:
         )  # fmt: skip
 
     def _frame(self, name: str, part: Surfels, class_id: int | None) -> Frame:
-        """Return the frame of the files of an item; raises ``NothingToExport`` if it stands on nothing.
+        """Return the frame of the files of an item; raise ``NothingToExport`` if it stands on nothing.
 
         part: its Gaussians, in the run's frame.
         """
@@ -170,12 +139,12 @@ class ExportJob:
         if (direction := self.pose.direction()) is not None:
             frame = frame.turned(turn_to_z(torch.tensor(direction, dtype=torch.float64)))
         elif self.pose.up and class_id not in (None, BACKGROUND):
-            shown, doubt = self.shown.scene()
-            if shown is None:
+            scene, doubt = self.shown.scene()
+            if scene is None:
                 raise NothingToExport(
                     f"what {name!r} stands on is not known, as {doubt}: name the direction with --up."
                 )
-            plane = plane_under(name, part, class_id, shown, frame)
+            plane = plane_under(name, part, class_id, scene, frame)
             frame, floor = frame.turned(turn_to_z(plane.normal)), plane.offset
         if not (self.centred or self.pose.centre):
             return frame
@@ -188,16 +157,16 @@ class ExportJob:
     def _photos(self, class_id: int | None, part: Surfels, frame: Frame) -> tuple[Sequence[Photo] | None, str]:
         """Return the photos of an item in ``frame``, if an exporter needs them, or None and why there are none."""
         if not any(exporter.needs_photos for exporter in self.exporters.values()):
-            return None, "no exporter asked for photos"
-        shown, doubt = self.shown.scene()
-        photos = None if shown is None else photos_of(shown, class_id, part, frame)
+            return None, "no exporter needs photos"
+        scene, doubt = self.shown.scene()
+        photos = None if scene is None else photos_of(scene, class_id, part, frame)
         return (photos, "") if photos else (None, doubt or "no photo shows it")
 
     def _write(
         self, label: str, exporter: Exporter, path: Path, item: ExportItem, class_id: int | None
     ) -> ExportedFile:
         if self.tolerant and exporter.needs_photos and class_id == BACKGROUND:
-            reason = "a mesh of the background takes long: name it, with --object, where it is wanted"
+            reason = "a mesh of the background takes long: name it with --object if you want it"
             return ExportedFile(label, None, {}, reason)
         try:
             facts = exporter.write(path, item)

@@ -1,4 +1,4 @@
-"""What an export wrote, for users and manifests."""
+"""Records of exported files, for users and manifests."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from beags_plugin.surfaces.closing_surfels import Added
 
 @dataclass(frozen=True)
 class ExportedFile:
-    """One file: its format, its path and its exporter's facts; path None: nothing to write, for ``reason``."""
+    """One file: its format, its path and its exporter's facts. path: None if nothing was written, for ``reason``."""
 
     format: str
     path: Path | None
@@ -23,31 +23,31 @@ class ExportedFile:
         """Return a line for users."""
         if self.path is None:
             return f"no {self.format}: {self.reason}"
-        facts, said = self.facts, []
+        facts, parts = self.facts, []
         if "triangles" in facts:
-            said.append(f"{facts['triangles']:,} triangles")
+            parts.append(f"{facts['triangles']:,} triangles")
         if isinstance(texture := facts.get("texture"), dict):
             size, share = texture["size"], texture["from_photos"]
-            said.append(f"a texture of {size} x {size}, {share:.0%} of it from photos")
+            parts.append(f"a texture of {size} x {size}, {share:.0%} of it from photos")
         elif isinstance(texture, str) and texture != "none":
-            said.append(f"no texture{texture.removeprefix('none')}")
+            parts.append(f"no texture{texture.removeprefix('none')}")
         if "sides" in facts:
-            said.append(" x ".join(f"{side:.1f}" for side in facts["sides"]) + " mm")
+            parts.append(" x ".join(f"{side:.1f}" for side in facts["sides"]) + " mm")
         if "closed_share" in facts:
-            said.append(f"{facts['closed_share']:.0%} of the surface closed where no photo shows it")
+            parts.append(f"{facts['closed_share']:.0%} of the surface closed where no photo shows it")
         if facts.get("watertight") is False:
-            said.append("not watertight")
-        return f"{self.path} ({', '.join(said)})" if said else str(self.path)
+            parts.append("not watertight")
+        return f"{self.path} ({', '.join(parts)})" if parts else str(self.path)
 
 
 @dataclass(frozen=True)
 class Exported:
     """One object (or the background, or the whole scene) and its files.
 
-    class_id: None of the whole scene. center: [3] the point of the world that is the files' origin. up: [3] the
-    direction of the world that is the files' z. low, high: [3] its box, in the files' frame. to_run: the 4 x 4 matrix
-    from the files' frame to the run's normalised one. left_out: Gaussians of the object that do not belong to it; None
-    where none was looked for. added: Gaussians that close it in its splat files; None where none were asked for.
+    class_id: None for the whole scene. center: [3], the point of the world that is the files' origin. up: [3], the
+    direction of the world that is the files' z. low, high: [3], its box, in the files' frame. to_run: 4 x 4 matrix from
+    the files' frame to the run's normalised one. left_out: Gaussians of the object that do not belong to it; None if it
+    was not cleaned. added: Gaussians that close it in its splat files; None if it was not closed.
     """
 
     name: str

@@ -18,6 +18,7 @@ from beags_plugin.cleaning.clean import LeftOut
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.select import remove_class, select_class
 from beags_plugin.objects.clean import cleaner_of
+from beags_plugin.objects.shown import Shown
 from beags_plugin.runs.checkpoint_file import exposures_of, extra_state
 from beags_plugin.runs.layout import EXTRACTION_FILE, digest_of_prepared
 from beags_plugin.runs.read import SavedScene
@@ -33,8 +34,8 @@ from beags_plugin.system.whole_files import write_text_atomically
 class Extracted:
     """One extracted run.
 
-    name: of the run's folder and .ply. config, ply: paths of its config.yml and .ply. gaussians: how many it has.
-    left_out: Gaussians that were dropped because they do not belong to the object; None if nothing was looked for.
+    name: of the run's folder and .ply. config, ply: paths of its config.yml and .ply. gaussians: their number.
+    left_out: Gaussians that were removed because they do not belong to the object; None if it was not cleaned.
     """
 
     name: str
@@ -55,15 +56,14 @@ def extract_objects(
     data: Path | None = None,
     say: Callable[[str], None] = lambda sentence: None,
 ) -> list[Extracted]:
-    """Write a run and a .ply for each object, and return what was written, in order.
+    """Write a run and a .ply for each object; return them in order.
 
     config_path: config.yml of a run whose Gaussians have classes. objects: names; if empty, all objects that have
     Gaussians, but not the background. remove: write the scene without the object instead. output: folder for the runs;
-    ``extracted/`` in the run by default. progress: called with (done, total) objects. keep_all: keep Gaussians too that
-    do not belong to their object (``cleaning.clean``); with ``remove`` they go with it. data: folder of the
-    photos, if they have moved. say: called with a sentence on map coordinates, and, if ``objects`` is empty, on
-    objects without Gaussians. Raises ``UserError``, before anything is written, for an unknown name or an object
-    without Gaussians.
+    ``extracted/`` in the run by default. progress: receives (done, total) objects. keep_all: also keep Gaussians that
+    do not belong to their object (``cleaning.clean``); ``remove`` removes them too. data: folder of the scene if it has
+    moved. say: receives a sentence on map coordinates, and, if ``objects`` is empty, on objects without Gaussians.
+    Raises ``UserError``, before anything is written, for an unknown name or an object without Gaussians.
     """
     opened = Run(config_path, data)
     scene, run = opened.assigned, opened.folder
@@ -78,7 +78,7 @@ def extract_objects(
     folders, target = folder_names(scene.classes), output or run / "extracted"
     with writing(target):
         target.mkdir(parents=True, exist_ok=True)
-    cleaner = None if keep_all or remove else cleaner_of(opened)
+    cleaner = None if keep_all or remove else cleaner_of(Shown(opened))
     prepared = digest_of_prepared(run)  # shows later if the run was trained again
     written = []
     for name in names:
@@ -109,7 +109,7 @@ def extract_objects(
 
 
 def objects_with_gaussians(scene: SavedScene, objects: Sequence[str], run: Path) -> dict[str, int]:
-    """Return {name: class id} of the classes with Gaussians; raises ``UserError`` if one of ``objects`` has none."""
+    """Return {name: class id} of the classes with Gaussians; raise ``UserError`` if one of ``objects`` has none."""
     ids = {name: index for index, name in scene.classes.items()}
     for name in objects:
         check_choice(name, ids, "object", f" in {run}")
@@ -120,8 +120,20 @@ def objects_with_gaussians(scene: SavedScene, objects: Sequence[str], run: Path)
     return present
 
 
+def chosen_objects(scene: SavedScene, objects: Sequence[str], run: Path) -> dict[str, int]:
+    """Return {name: class id} of ``objects`` in their order; if empty, of all objects that have Gaussians.
+
+    Raises ``UserError`` for an object without Gaussians, and if there is none but the background.
+    """
+    present = objects_with_gaussians(scene, objects, run)
+    chosen = objects or [name for name, class_id in present.items() if class_id != 0]
+    if not chosen:
+        raise UserError(f"{run} holds no object but the background: name another run, or --object background.")
+    return {name: present[name] for name in chosen}
+
+
 def empty_objects(scene: SavedScene, run: Path) -> dict[str, int]:
-    """Return {name: class id} of the classes without Gaussians; nothing for an extracted run, which lacks some."""
+    """Return {name: class id} of the classes without Gaussians; empty for an extracted run, which holds few objects."""
     if (run / EXTRACTION_FILE).exists():
         return {}
     there = set(scene.members.present())
@@ -129,13 +141,13 @@ def empty_objects(scene: SavedScene, run: Path) -> dict[str, int]:
 
 
 def said_of_empty(empty: Collection[str], done: str) -> str:
-    """Return a sentence on objects without Gaussians. done: what is not done with them, such as "extracted"."""
+    """Return a sentence on objects without Gaussians. done: the verb, such as "extracted"."""
     names = ", ".join(map(repr, empty))
     return f"no Gaussian belongs to {names}: nothing is {done} of {'it' if len(empty) == 1 else 'them'}."
 
 
 def _rows(state: dict[str, Any], index: Tensor, members: Membership) -> dict[str, Any]:
-    """Return a model's state with the Gaussians ``index`` [M] int64 alone, and their classes."""
+    """Return a model's state with only the Gaussians ``index`` [M] int64, and their classes."""
     rows = {
         name: value[index] if name == "class_margin" or name.startswith("gauss_params.") else value
         for name, value in state.items()
@@ -146,25 +158,25 @@ def _rows(state: dict[str, Any], index: Tensor, members: Membership) -> dict[str
 
 
 def folder_names(classes: dict[int, str], taken: Collection[str] = ()) -> dict[int, str]:
-    """Return {class id: name of its folder or files}, no two the same, also on file systems that ignore case.
+    """Return {class id: name of its folder or files}; names are unique, also on file systems that ignore case.
 
-    A name that two classes share, or that is ``taken``, gets the id appended, and a number if that is taken as well.
+    A name that two classes share, or that is ``taken``, gets the id appended, and a number if that is taken too.
     """
     plain = {index: file_name(name) for index, name in classes.items()}
     shared = Counter(name.casefold() for name in (*plain.values(), *taken))  # some file systems ignore case
-    found, used = {}, set(shared)
+    names, used = {}, set(shared)
     for index, name in plain.items():
         if shared[name.casefold()] > 1:
             longer = chain([f"{name}_{index}"], (f"{name}_{index}_{number}" for number in count(2)))
             name = next(each for each in longer if each.casefold() not in used)
             used.add(name.casefold())
-        found[index] = name
-    return found
+        names[index] = name
+    return names
 
 
 def file_name(name: str) -> str:
-    """Return a class name as part of a path: what is no letter, digit, hyphen or underscore becomes an underscore.
+    """Return a class name as part of a path: all but letters, digits and hyphens become underscores.
 
-    Dots do too. Otherwise ``cup.compressed`` as .ply and ``cup`` as .compressed.ply would be one file.
+    Dots do too, as ``cup.compressed`` as .ply and ``cup`` as .compressed.ply would else be one file.
     """
     return re.sub(r"[^\w-]+", "_", name).strip("_") or "object"

@@ -1,4 +1,4 @@
-"""``beags masks truth``: downloaded masks of a scene, written where evaluation finds them."""
+"""``beags masks truth``: write downloaded masks of a scene where evaluation finds them."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ PROMPTS = "prompts.json"
 
 
 def import_truth(data: DataOptions, objects: Sequence[DownloadedObject], overwrite: bool = False) -> list[str]:
-    """Write visible masks to ground_truth/visible/<object>/<photo>.png, and scribbles to prompts.json, of a scene.
+    """Write visible masks of a scene to ground_truth/visible/<object>/<photo>.png, and scribbles to prompts.json.
 
-    Masks keep their size. data: names the scene. overwrite: replace files that are there. Returns lines that report
-    it. Raises ``UserError`` before anything is written: for no photo of a mask's name, or masks in other proportions.
+    Masks keep their size. data: names the scene. overwrite: replace existing files. Returns lines that report the
+    files. Raises ``UserError``, before anything is written, if no photo has a mask's name, or proportions differ.
     """
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio lists its splits
         parser = SceneData(data)
@@ -87,18 +87,18 @@ def import_truth(data: DataOptions, objects: Sequence[DownloadedObject], overwri
             f"  beags masks make --data {quoted(scene.root)} --source sam2 --options prompts={quoted(prompts)}"
         )
     elif not any(each.scribbles for each in objects):
-        lines.append("No scribbles are there, so no prompts are written.")
+        lines.append("There are no scribbles, so no prompts are written.")
     else:
-        lines.append("No photo here has the scribbles, so no prompts are written.")
+        lines.append("No photo of the scene has scribbles, so no prompts are written.")
     return lines
 
 
 def _check_proportions(file: Path, size: tuple[int, int], image: Path) -> None:
-    """Raise ``UserError`` for a file of other proportions than its photo."""
+    """Raise ``UserError`` if the proportions of a file differ from its photo's."""
     width, height = image_size(image)
     if not same_proportions((width, height), size):
         raise UserError(
-            f"{file} is {size[0]}x{size[1]} pixels but the photo {image} is {width}x{height}: they are not of one view."
+            f"{file} is {size[0]}x{size[1]} pixels but the photo {image} is {width}x{height}: use files of one view."
         )
 
 

@@ -1,4 +1,4 @@
-"""``beags masks make``: masks of a scene from a registered source, written as id images."""
+"""``beags masks make``: write masks of a scene from a registered source as id images."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.data.files import image_size, list_photos, photo_names
 from beags_plugin.data.layout import fitting_layouts
 from beags_plugin.data.orientation import as_stored
-from beags_plugin.labels.classes import NO_TRUTH, check_names, write_mask
+from beags_plugin.labels.classes import NO_TRUTH, check_names, read_id_mask, write_mask
 from beags_plugin.masks.snapping import snap_to_edges
 from beags_plugin.masks.sources import MASK_SOURCES
 from beags_plugin.masks.sources.base import MaskSource, NothingFound, Photo, SourceScene
 from beags_plugin.objects.check_masks import check, options_beside, write_contradictions
 from beags_plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
+from beags_plugin.pictures.cells import below, cell, wrapped, write_picture
 from beags_plugin.pictures.masks import overlay
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
 from beags_plugin.runs.relocation import open_run
@@ -37,7 +38,7 @@ from beags_plugin.views.scene_data import SceneData
 
 
 class RunGeometry:
-    """The surfaces of a trained run, at the size of the photographs: of its training views, then of the others."""
+    """The surfaces of a trained run at the size of the photos, for its training views, then for the others."""
 
     def __init__(self, config_path: Path, data: Path | None = None) -> None:
         self.folder = config_path.parent
@@ -48,7 +49,7 @@ class RunGeometry:
         self._of_split: list[tuple[Literal["train", "eval"], int]] = [("train", i) for i in range(len(self.images))]
         held_out = zip(self.manager.eval_dataset.image_filenames, self.manager.views("eval"), strict=True)
         for index, (image, view) in enumerate(held_out):
-            if image not in self.images:  # without held-out views, those that are trained on serve both
+            if image not in self.images:  # the training views serve as both if none is held out
                 self._of_split.append(("eval", index))
                 self.images.append(image)
                 self.cameras.append(view.camera)
@@ -66,10 +67,10 @@ class RunGeometry:
         """Return the centres of the Gaussians, [N, 3] float64, in the frame of the input poses."""
         transform, scale = self.run.transform or (torch.eye(3, 4, dtype=torch.float64), 1.0)
         means = self.surfels().means.detach().double().cpu()
-        return (means / scale - transform[:, 3]) @ transform[:, :3]  # in double: the world may lie far from 0
+        return (means / scale - transform[:, 3]) @ transform[:, :3]  # double precision, as the world may lie far from 0
 
     def depth(self, view: int) -> Tensor:
-        """Return [h, w] float32."""
+        """Return the depth of the surface, [h, w] float32."""
         kind = self.run.config.model_config.prepare.depth
         with torch.no_grad():
             render = self.rasterizer.rasterize(self._surfels, self.cameras[view], self.settings, torch.zeros(3))
@@ -85,7 +86,7 @@ class RunGeometry:
 
 
 def configured_source(name: str, options: Sequence[str]) -> MaskSource:
-    """Return a registered source with options "key=value"; raises ``UserError`` for an unknown key or a wrong value."""
+    """Return a registered source with options "key=value"; raise ``UserError`` for an unknown key or a wrong value."""
     import tyro
 
     kind: Any = MASK_SOURCES.get(name)
@@ -107,7 +108,7 @@ def configured_source(name: str, options: Sequence[str]) -> MaskSource:
     except SystemExit:
         usual = ", ".join(f"{key}={getattr(kind, key)}" for key in known if hasattr(kind, key))
         raise UserError(
-            f"the options {' '.join(options)} of the mask source {name} have a wrong value: give such as {usual}."
+            f"the options {' '.join(options)} of the mask source {name} have a wrong value: the defaults are {usual}."
         ) from None
     if reason := source.unavailable():
         raise UserError(f"the mask source {name} cannot run: {reason}")
@@ -125,13 +126,13 @@ def make_masks(
 ) -> list[str]:
     """Write the masks of a scene: <output>/masks/<stem>.png, classes.json and made.png, a picture of them.
 
-    The files take their places once all are made; no old mask of any view stays. Masks only to look at go likewise to
-    <output>/masks_to_look_at/, which nothing reads. data: names the scene. run: config.yml of a run trained on it, for
-    sources that need its depth. output: the scene's own folder if None, where ``beags-data`` looks for them. overwrite:
-    replace existing masks. snap: radius in pixels of ``masks.snapping.snap_to_edges``; 0 leaves boundaries as they are.
-    upright: the source's masks are of photos as EXIF says that one holds them; they are turned as these are stored.
-    Returns lines that report the written files, and what ``beags masks check`` finds in them. Raises ``UserError``
-    before anything is written, or for bad input.
+    The files replace the old masks of all views once all are made. Masks that are only to look at are written in the
+    same way to <output>/masks_to_look_at/, which nothing reads. data: names the scene. run: config.yml of a run trained
+    on it, for sources that need its depth. output: if None the scene's own folder, where ``beags-data`` looks for
+    masks. overwrite: replace existing masks. snap: radius in pixels of ``masks.snapping.snap_to_edges``; 0 leaves
+    outlines unchanged. upright: the source makes masks of the upright photos; they are turned to the photos as stored.
+    Returns lines that report the written files and the findings of ``beags masks check``. Raises ``UserError``, before
+    anything is written, for bad input.
     """
     root, images, trained, posed = _photos(data, source)
     folder = output or root
@@ -153,11 +154,11 @@ def make_masks(
     ]
     if upright:
         if source.needs_run:
-            raise UserError("this mask source looks at the photos as they are stored: leave --upright out.")
+            raise UserError("this mask source uses the photos as they are stored: leave --upright out.")
         photos = [photo.upright() for photo in photos]
-    made_of = SourceScene(root, photos, RunGeometry(run, data.data) if run is not None and source.needs_run else None)
+    geometry = RunGeometry(run, data.data) if run is not None and source.needs_run else None
     shares: list[float] = []
-    shown: list[tuple[Photo, Path]] = []
+    pictured: list[tuple[Photo, Path]] = []
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     with (
@@ -166,7 +167,7 @@ def make_masks(
         progress_bar("Making masks") as progress,
     ):
         unfinished = {place: Path(temporary) / place.name for place in (masks, look_at)}
-        made = source.make(made_of, progress)
+        made = source.make(SourceScene(root, photos, geometry), progress)
         check_names(made.names)
         for index, (path, labels) in enumerate(zip(mask_paths(images), made.maps, strict=True)):
             if labels is None:
@@ -180,7 +181,7 @@ def make_masks(
             write_mask(file, labels)
             if place is masks:
                 shares.append(float((labels != 0).mean()))
-            shown.append(
+            pictured.append(
                 (replace(photos[index], turned=1, width=labels.shape[1], height=labels.shape[0]), place / path)
             )
         if not shares:
@@ -190,16 +191,16 @@ def make_masks(
                 "the mask source found no object in any view: name another source, or check its options."
             )
         for place, new in unfinished.items():
-            _take_the_place(new, place, {image.stem for image in images})
+            _replace_masks(new, place, {image.stem for image in images})
         (masks / NO_TRUTH).unlink(missing_ok=True)
         if source.guesses and not posed:
             (masks / NO_TRUTH).write_text(json.dumps({"made by": type(source).__name__}))
     names = {str(i): name for i, name in sorted(made.names.items())}
     write_whole(classes, lambda file: file.write(json.dumps(names, indent=1).encode()))
-    _picture(folder / "made.png", shown)
-    aside = len(shown) - len(shares)
+    _picture(folder / "made.png", pictured)
+    aside = len(pictured) - len(shares)
     checked: list[str] = []
-    with suppress(UserError):  # of photos without poses; else training says it
+    with suppress(UserError):  # training reports other errors; photos without poses cannot be checked
         given = data if run is None else options_beside(run, data.data, images_path=data.images_path)
         report = check(replace(given, masks_path=masks.absolute(), classes_path=classes.absolute()), run=run)
         checked = [*report.lines(), *(str(path) for path in write_contradictions(report, folder))]
@@ -220,17 +221,16 @@ def make_masks(
 def _photos(data: DataOptions, source: MaskSource) -> tuple[Path, list[Path], set[int], bool]:
     """Return the scene's folder, its photos, which of them are for training, and whether they have poses."""
     root = Path(data.data).absolute()
-    if data.layout == "auto" and not source.needs_run and root.is_dir() and not fitting_layouts(root):
-        found = list_photos(root)
-        if found:
-            return root, found, set(range(len(found))), False
+    unposed = data.layout == "auto" and not source.needs_run and root.is_dir() and not fitting_layouts(root)
+    if unposed and (photos := list_photos(root)):
+        return root, photos, set(range(len(photos))), False
     parser = SceneData(data)
     scene, views = parser.posed_views()
     return scene.root, list(views.images), set(parser.views_of_split(views, "train")), True
 
 
-def _take_the_place(unfinished: Path, masks: Path, stems: set[str]) -> None:
-    """Move the new masks to ``masks``, instead of all that are there for images of these stems."""
+def _replace_masks(unfinished: Path, masks: Path, stems: set[str]) -> None:
+    """Move the new masks to ``masks``, and remove the old ones of images with these stems."""
     for old in list(masks.rglob("*.png")):
         if old.stem in stems:
             old.unlink()
@@ -240,13 +240,10 @@ def _take_the_place(unfinished: Path, masks: Path, stems: set[str]) -> None:
         new.replace(place)
 
 
-def _picture(path: Path, shown: Sequence[tuple[Photo, Path]], most: int = 24) -> None:
-    from beags_plugin.labels.classes import read_id_mask
-    from beags_plugin.pictures.cells import below, cell, wrapped, write_picture
-
-    step = -(-len(shown) // most)
+def _picture(path: Path, pictured: Sequence[tuple[Photo, Path]]) -> None:
+    """Draw the masks of at most 24 photos over these."""
     cells = []
-    for photo, mask in shown[::step]:
+    for photo, mask in pictured[:: -(-len(pictured) // 24)]:
         size = (260, max(1, round(260 * photo.height / photo.width)))
         cells.append([cell(overlay(photo.pixels(), read_id_mask(mask)), size, photo.name)])
     write_picture(path, below(wrapped(cells, 1100)))

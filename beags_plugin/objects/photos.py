@@ -1,4 +1,4 @@
-"""The photos of an object of a run, for textures: the part of each that shows it."""
+"""Photos of an object of a run, cropped to it, for textures."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.objects.shown import ShownScene
 from beags_plugin.surfaces.frames import Frame, bounding_box
 from beags_plugin.surfaces.item import Photo
+from beags_plugin.views.cameras import small_camera
 from beags_plugin.views.close_ups import fitted
-from beags_plugin.views.small_views import small_camera
 from beags_plugin.views.split_photos import resize_area
 
-_AROUND = 0.1  # A crop shows this share of the object's box beside it too.
-_MARGIN = 8  # pixels more
-_KEPT = 200_000_000  # bytes of an object's photos, masks and depths that stay in memory
-_SHARPER = 1.25  # least pixels along a side of a file's region, over those that were trained on, for which it is read
+_AROUND = 0.1  # margin of a crop, over the object's box in space
+_MARGIN = 8  # further margin in pixels
+_KEPT = 200_000_000  # most bytes of an object's photos, masks and depths that stay in memory
+_SHARPER = 1.25  # least side of a file's region, over that of the training, for which it is read
 
 Box = tuple[int, int, int, int]
 """Left, top, right and bottom, pixels; right and bottom are excluded."""
 
 
 class _Kept:
-    """Tensors that are made when they are first asked for, and kept while all take at most ``_KEPT`` bytes."""
+    """Tensors that are made when first used, and stay in memory while all take at most ``_KEPT`` bytes."""
 
     def __init__(self) -> None:
         self._values: dict[tuple[str, int], Tensor] = {}
@@ -43,33 +43,34 @@ class _Kept:
         size = made.numel() * made.element_size()
         if self._bytes + size <= _KEPT:
             self._bytes += size
-            self._values[name, view] = made = made.clone()  # a part would keep all of its picture
+            self._values[name, view] = made = made.clone()  # a view would keep its whole picture in memory
         return made
 
 
 def photos_of(shown: ShownScene, class_id: int | None, part: Surfels, frame: Frame) -> Sequence[Photo]:
-    """Return the photos of a class (None: of all of them) in ``frame``; images, masks and depth are read when used.
+    """Return the photos of a class (None: of all classes) in ``frame``; images, masks and depth are read when used.
 
-    part: its Gaussians, in the run's frame. Photos are cropped to its box, and those that lack it left out. Each has a
-    ``sharper`` one where its file has more pixels than were trained on; all of these take at most ``_KEPT`` bytes.
+    part: its Gaussians, in the run's frame. Photos are cropped to its box, and photos that do not show the box left
+    out. A photo whose file has more pixels than the training used has a ``sharper`` one; all of these take at most
+    ``_KEPT`` bytes.
     """
-    kept, found = _Kept(), list[tuple[int, Box]]()
+    kept, boxes = _Kept(), list[tuple[int, Box]]()
     low, high = bounding_box(part)
     reach = _AROUND * (high - low)
     corners = torch.cartesian_prod(*torch.stack([low - reach, high + reach], dim=1).double())
     for view, camera in enumerate(shown.views.cameras):
         box = _box(camera, corners) if class_id is not None else (0, 0, camera.width, camera.height)
         if box is not None:
-            found.append((view, box))
-    sharp, most = _Kept(), _KEPT / 3 / max(len(found), 1)
+            boxes.append((view, box))
+    sharp, most = _Kept(), _KEPT / 3 / max(len(boxes), 1)
     return [_photo(shown, class_id, frame, view, box, kept, _sharper(shown, class_id, frame, view, box, sharp, most))
-            for view, box in found]  # fmt: skip
+            for view, box in boxes]  # fmt: skip
 
 
 def _photo(
     shown: ShownScene, class_id: int | None, frame: Frame, view: int, box: Box, kept: _Kept, sharper: Photo | None
 ) -> Photo:
-    """Return a part of a photo at the size that was trained on."""
+    """Return a part of a photo at the size of the training."""
     left, top, right, bottom = box
     there = slice(top, bottom), slice(left, right)
     image = partial(kept.get, "image", view, partial(_image, shown, view, there))
@@ -82,7 +83,7 @@ def _photo(
 def _sharper(
     shown: ShownScene, class_id: int | None, frame: Frame, view: int, box: Box, kept: _Kept, most: float
 ) -> Photo | None:
-    """Return a part of a photo with the pixels of its file, at most ``most``; None where these are hardly more."""
+    """Return a part of a photo with at most ``most`` pixels of its file; None if these are hardly more."""
     if class_id is None:
         return None
     files, index = shown.manager.files["train"], shown.chosen[view]
@@ -94,7 +95,7 @@ def _sharper(
     zoom = size[0] * across / (right - left)
     if zoom < _SHARPER:
         return None
-    # the pixel of the photo that was trained on at the middle of each finer one
+    # Pixels of the photo at the size of the training, at the middle of each finer pixel.
     columns = (((torch.arange(size[0]) + 0.5) * (right - left) / size[0] + left) / across).long()
     rows = (((torch.arange(size[1]) + 0.5) * (bottom - top) / size[1] + top) / down).long()
     there = rows.clamp(max=camera.height - 1)[:, None], columns.clamp(max=camera.width - 1)[None]
@@ -116,7 +117,7 @@ def _sharper(
 
 
 def _box(camera: Camera, corners: Tensor) -> Box | None:
-    """Return where a view shows a box of 8 corners [8, 3]; all of the view from within, None if it does not."""
+    """Return the part of a view that shows a box of 8 corners [8, 3]; all of it from inside, None if none."""
     xy, z = project(corners, camera.to(torch.float64))
     if bool((z <= 0).all()):
         return None
@@ -129,13 +130,13 @@ def _box(camera: Camera, corners: Tensor) -> Box | None:
 
 
 def _image(shown: ShownScene, view: int, there: tuple[slice, slice]) -> Tensor:
-    """Return a photo [H, W, 3] in the exposure of the scene."""
+    """Return a part of a photo [H, W, 3] in the scene's exposure."""
     image = shown.photos[view].image.cpu()[there]
     return image if shown.exposures is None else shown.exposures.evened(image, shown.names[view])
 
 
 def _own(shown: ShownScene, view: int, class_id: int | None, there: tuple[slice, slice]) -> Tensor:
-    """Return the pixels [H, W] bool of a class; evened exposures make grey of burnt-out ones, so these are left out."""
+    """Return the pixels [H, W] bool of a class, without overexposed ones, which the scene's exposure turns grey."""
     labels = shown.views.labels[view].cpu()[there]
     own = torch.ones_like(labels, dtype=torch.bool) if class_id is None else labels == class_id
     return own if shown.exposures is None else own & (shown.photos[view].image.cpu()[there] < 1.0).any(dim=2)

@@ -1,4 +1,4 @@
-"""Masks of objects that were picked in the viewer, so that refinement makes them clean."""
+"""Masks of objects that were picked in the viewer, for refinement."""
 
 from __future__ import annotations
 
@@ -21,25 +21,22 @@ from beags_plugin.system.pasted import command
 from beags_plugin.system.whole_files import write_text_atomically
 from beags_plugin.views.data_options import DataOptions
 
-STAMP = "masks_picked.txt"  # beside masks that were picked: a digest of them, which shows whether they were mended
-FOLDER = "picked"  # in the run, for masks that must not replace the scene's
+STAMP = "masks_picked.txt"  # file with a digest of the picked masks beside it, which shows if they were edited
+FOLDER = "picked"  # folder of the run for masks that must not replace the scene's
 
 
 @dataclass(frozen=True)
 class SavedMasks:
-    """Masks that were written: sentences on where, and the command that refines with them."""
+    """Masks that were written: sentences that name the files, and the command that refines with them."""
 
     said: str
     command: str
 
 
 def masks_folder(run: Path) -> Path:
-    """Return the folder beside a run that takes its next masks: ``picked``, or ``picked_2`` and so on.
-
-    A folder with masks that were not written by ``save_masks``, or have been changed since, is left alone.
-    """
-    numbers = range(2, 1000)
-    return next((place for place in [run / FOLDER, *(run / f"{FOLDER}_{n}" for n in numbers)] if _free(place)), run)
+    """Return the first of a run's folders ``picked``, ``picked_2``, ... whose masks are not ``masks_changed``."""
+    names = [FOLDER, *(f"{FOLDER}_{number}" for number in range(2, 1000))]
+    return next((run / name for name in names if not masks_changed(run / name)), run)
 
 
 def save_masks(
@@ -51,9 +48,9 @@ def save_masks(
 ) -> SavedMasks:
     """Write masks of all training views, classes.json and made.png.
 
-    config_path: of the run. members: of its Gaussians. folder: for the masks; that of ``masks_folder`` if None. photos:
-    folder of the scene, if not where the run was trained on it. Raises ``UserError`` if there is no object, where files
-    cannot be written, and for a folder with masks that were not written here, or have been changed since.
+    config_path: of the run. members: of its Gaussians. folder: for the masks; ``masks_folder`` if None. photos: folder
+    of the scene if it has moved. Raises ``UserError`` if there is no object, if files cannot be written, and for a
+    folder with ``masks_changed``.
     """
     if not any(class_id != BACKGROUND for class_id in members.present()):
         raise UserError("nothing has been picked yet: click on an object first.")
@@ -61,22 +58,22 @@ def save_masks(
     scene = Path(data.data).absolute()
     scene = scene if scene.is_dir() else scene.parent
     folder = masks_folder(run) if folder is None else folder.absolute()
-    if folder == run or not _free(folder):
+    if folder == run or masks_changed(folder):
         raise UserError(f"{folder} holds masks that were not written here, or have been changed: name another folder.")
     again = _holds_masks(folder)
     make_masks(data, DrawnSource(members, names), config_path, folder, overwrite=again)
     write_text_atomically(_digest(folder), folder / STAMP)
-    said = f"{'Replaced' if again else 'Saved'} {folder / 'masks'} and classes.json; look at {folder / 'made.png'}."
+    sentence = f"{'Replaced' if again else 'Saved'} {folder / 'masks'} and classes.json; look at {folder / 'made.png'}."
     own: dict[str, Any] = {"masks_path": None, "classes_path": Path("classes.json"), "ignore_ids": ()}
     if folder != scene:
         own |= {"masks_path": folder / "masks", "classes_path": folder / "classes.json"}
-    return SavedMasks(said, refinement_command(open_run(config_path, photos), replace(data, **own)))
+    return SavedMasks(sentence, refinement_command(open_run(config_path, photos), replace(data, **own)))
 
 
 def refinement_command(config: RunConfig, parser: DataOptions) -> str:
-    """Return the command that refines the scene of a run, or the base that a refined run began with, with other masks.
+    """Return the command that refines a run, or the base of a refined run, with other masks.
 
-    parser: the run's options of data, with the masks.
+    parser: the run's data options, with the masks.
     """
     photos = config.data_config.photos
     words = [
@@ -88,9 +85,9 @@ def refinement_command(config: RunConfig, parser: DataOptions) -> str:
 
 
 def option_words(parser: DataOptions) -> list[str]:
-    """Return the options of ``beags-data`` that make a data parser, as words of a command; none for the usual ones.
+    """Return the options of ``beags-data`` that differ from the defaults, as words of a command.
 
-    Those that the command line does not offer are left out.
+    Options that the command line does not offer are left out.
     """
     usual, words = DataOptions(), []
     for field in fields(parser):
@@ -104,19 +101,12 @@ def option_words(parser: DataOptions) -> list[str]:
 
 def masks_changed(folder: Path) -> bool:
     """Return whether a folder has masks that were not written by ``save_masks``, or have been changed since."""
-    return not _free(folder)
+    stamp = folder / STAMP
+    return _holds_masks(folder) and not (stamp.exists() and stamp.read_text() == _digest(folder))
 
 
 def _holds_masks(folder: Path) -> bool:
     return any((folder / "masks").rglob("*.png")) or (folder / "classes.json").exists()
-
-
-def _free(folder: Path) -> bool:
-    """Return whether a folder has no masks, or those that were written here, as they were."""
-    if not _holds_masks(folder):
-        return True
-    stamp = folder / STAMP
-    return stamp.exists() and stamp.read_text() == _digest(folder)
 
 
 def _digest(folder: Path) -> str:

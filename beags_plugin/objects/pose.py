@@ -1,4 +1,4 @@
-"""Where exported objects of a run stand, and how large they are."""
+"""The plane that exported objects of a run stand on, and their size."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from beags_plugin.views.run_data import RunData, Split
 from beags_plugin.views.split_photos import SplitPhotos
 from beags_plugin.views.views import unique_names
 
-_VIEWS = 24  # that are lifted to find a plane
-_POINTS = 4000  # of each of them, at most
+_VIEWS = 24  # most views that are lifted to find a plane
+_POINTS = 4000  # most points of each view
 
 
 def plane_under(name: str, part: Surfels, class_id: int, shown: ShownScene, frame: Frame) -> Plane:
@@ -42,24 +42,24 @@ def plane_under(name: str, part: Surfels, class_id: int, shown: ShownScene, fram
         points = lift(depth.double() / frame.scale, camera.to(torch.float64))
         seen = (depth > 0) & ((points - middle).abs().amax(dim=-1) < 2 * reach)
         ups.append(-camera.rotation[1].double())
-        for mask, found in (
+        for mask, chosen in (
             (seen & (labels == class_id), own),
             (seen & (labels != class_id) & (labels != IGNORE), around),
         ):
-            chosen = points[mask]
-            found.append(chosen[:: max(1, len(chosen) // _POINTS)])
+            inside = points[mask]
+            chosen.append(inside[:: max(1, len(inside) // _POINTS)])
     plane = standing_plane(torch.cat(around), torch.cat(own), torch.stack(ups).mean(dim=0))
     if plane is None:
         raise NothingToExport(
-            f"no plane is seen that {name!r} stands on: name the direction that is up, such as --up 0,0,1."
+            f"the views show no plane that {name!r} stands on: name the direction that is up, such as --up 0,0,1."
         )
     return plane
 
 
 def metres_per_unit(length: KnownLength, run: Run, world: Frame) -> float:
-    """Return how many metres a unit of ``world`` is, by a known length in it.
+    """Return the metres in a unit of ``world``, from a known length in it.
 
-    Raises ``UserError`` for a photo or pixel that is not there, or points that coincide.
+    Raises ``UserError`` for a photo or pixel that does not exist, and for points that coincide.
     """
     first, second = (_place(point, run, world) for point in (length.first, length.second))
     apart = float((first - second).norm())
@@ -84,9 +84,12 @@ def _place(point: Point, run: Run, world: Frame) -> Tensor:
 
 
 def _pixel(point: PhotoPoint, manager: RunData) -> tuple[Camera, float, float]:
-    """Return the straight camera of a photo, and where the pixel of its file is in it (centres at + 0.5)."""
+    """Return the camera of a photo without lens distortion, and the place of its file's pixel in it, (x, y).
+
+    Pixel centres are at + 0.5.
+    """
     datasets: dict[Split, SplitPhotos] = {"train": manager.train_dataset, "eval": manager.eval_dataset}
-    files: dict[Path, tuple[Split, int]] = {}  # without held-out photos, both splits have the same
+    files: dict[Path, tuple[Split, int]] = {}  # both splits are the same without held-out photos
     for split, dataset in datasets.items():
         for index, file in enumerate(dataset.image_filenames):
             files.setdefault(Path(file), (split, index))

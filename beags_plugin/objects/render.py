@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -9,10 +10,10 @@ from typing import get_args
 
 import torch
 
+from beags_plugin.core.cameras import Camera, viewmat_from_opengl
 from beags_plugin.core.select import select_class
-from beags_plugin.objects.camera_path import read_camera_path
 from beags_plugin.objects.export import Progress
-from beags_plugin.objects.extract import folder_names, objects_with_gaussians
+from beags_plugin.objects.extract import chosen_objects, folder_names, objects_with_gaussians
 from beags_plugin.pictures.cells import write_picture
 from beags_plugin.pictures.objects import Subject, comparison, film, sheet
 from beags_plugin.pictures.options import PictureFormat, RenderOptions
@@ -23,8 +24,10 @@ from beags_plugin.runs.read import SavedScene
 from beags_plugin.runs.run import Run
 from beags_plugin.surfaces.frames import bounding_box
 from beags_plugin.system.errors import UserError, check_choice
+from beags_plugin.system.reading.text import load_json, reason
 
 _PICTURES = (".png", ".jpg", ".jpeg")
+_MOST_PIXELS, _MOST_CAMERAS = 8192, 100_000  # bounds of a camera path: of a side, and of its length
 
 
 def render_run(
@@ -39,9 +42,10 @@ def render_run(
     """Render objects of a run alone, from cameras around each, into one file; return its path.
 
     config_path: config.yml of a refined (or assigned) run. objects: names; all but the background if empty. form:
-    "video" (.mp4, .gif), "sheet" (.png, .jpg), or "before-after": assignment alone beside the refined object from the
-    same cameras, either. output: the file; in ``renders/`` of the run if None. progress: receives (done, total)
-    pictures. data: if not where they were. Raises ``UserError`` for a mistake, before anything is rendered.
+    "video" (.mp4, .gif), "sheet" (.png, .jpg), or "before-after", either kind of file with the object before and after
+    refinement from the same cameras. output: the file; in ``renders/`` of the run if None. progress: receives (done,
+    total) pictures. data: folder of the scene if it has moved. Raises ``UserError`` for a mistake, before anything is
+    rendered.
     """
     options = options or RenderOptions()
     options.check()
@@ -50,17 +54,14 @@ def render_run(
         return _along(options.camera_path, config_path, objects, form, output, options, progress)
     run = Run(config_path, data)
     scene = run.assigned
-    present = objects_with_gaussians(scene, objects, config_path.parent)
-    names = list(dict.fromkeys(objects)) or [name for name, class_id in present.items() if class_id != 0]
-    if not names:
-        raise UserError(f"{config_path} holds no object but the background: name it with --object background.")
+    chosen = chosen_objects(scene, objects, config_path.parent)
     if output is None:
-        title = folder_names(scene.classes)[present[names[0]]] if len(names) == 1 else "objects"
+        title = folder_names(scene.classes)[next(iter(chosen.values()))] if len(chosen) == 1 else "objects"
         suffix = ".png" if form != "video" else _film_suffix()
         output = config_path.parent / "renders" / f"{title}_{form}{suffix}"
     moving = _check_output(output, form)
     stages = {"": scene} if form != "before-after" else {"before": _base_of(config_path), "after": scene}
-    subjects = _subjects(run, stages, names, present, form, moving, options)
+    subjects = _subjects(run, stages, chosen, form, moving, options)
     if moving:
         write_film(output, film(subjects, run.rasterizer, options.background, progress), options.fps)
     else:
@@ -95,18 +96,18 @@ def _along(
     scene = run.assigned if objects or form != "video" else run.scene
     stages = {"": scene} if form == "video" else {"before": _base_of(config_path), "after": scene}
     present = objects_with_gaussians(scene, objects, config_path.parent) if objects else {}
-    shown = {}
+    parts = {}
     for caption, each in stages.items():
         surfels, members = each.surfels(), each.members
         chosen = [members.of(present[name]) for name in objects]
-        shown[caption] = surfels[torch.stack(chosen).any(dim=0)] if chosen else surfels
-    subject = Subject("", shown, cameras, run.settings)
+        parts[caption] = surfels[torch.stack(chosen).any(dim=0)] if chosen else surfels
+    subject = Subject("", parts, cameras, run.settings)
     write_film(output, film([subject], run.rasterizer, options.background, progress), fps)
     return output
 
 
 def _check_output(path: Path, form: str) -> bool:
-    """Return True if the file is a film; raises ``UserError`` for a name that does not fit the format."""
+    """Return whether the file is a film; raise ``UserError`` for a name that does not fit the format."""
     suffix = path.suffix.lower()
     if form == "video" or (form == "before-after" and suffix in FILMS):
         check_film(path)
@@ -118,11 +119,11 @@ def _check_output(path: Path, form: str) -> bool:
 
 
 def _base_of(config_path: Path) -> SavedScene:
-    """Return the state with assignment alone, which a refined run has kept."""
+    """Return the state before refinement, which a refined run has saved."""
     snapshot = config_path.parent / BASE_SNAPSHOT / "config.yml"
     if not snapshot.exists():
         raise UserError(
-            f"{config_path.parent} has kept no state before refinement ({BASE_SNAPSHOT}/): name the run that was "
+            f"{config_path.parent} has no saved state from before refinement ({BASE_SNAPSHOT}/): name the run that was "
             "refined, or another --format."
         )
     return Run(snapshot).assigned
@@ -131,26 +132,55 @@ def _base_of(config_path: Path) -> SavedScene:
 def _subjects(
     run: Run,
     stages: dict[str, SavedScene],
-    names: Sequence[str],
-    present: dict[str, int],
+    chosen: dict[str, int],
     form: str,
     moving: bool,
     options: RenderOptions,
 ) -> list[Subject]:
     try:
         photos = run.viewpoints.cameras
-    except UserError:  # the data are gone: nerfstudio's frame has z up
+    except UserError:  # the data are missing; z of nerfstudio's frame is up
         photos = []
     count = options.frames if moving else options.views
     if form == "before-after" and not moving:
         count = max(1, count // 2)
     size = options.size or (480 if moving else 400 if form == "before-after" else 232)
     subjects = []
-    for name in names:
-        shown = {
-            caption: select_class(scene.surfels(), scene.members, present[name])[0] for caption, scene in stages.items()
+    for name, class_id in chosen.items():
+        parts = {
+            caption: select_class(scene.surfels(), scene.members, class_id)[0] for caption, scene in stages.items()
         }
-        stand = orbit_frame(*bounding_box(list(shown.values())[-1]), photos)
+        stand = orbit_frame(*bounding_box(list(parts.values())[-1]), photos)
         cameras = orbit(stand, count, size, options.elevation, options.turn)
-        subjects.append(Subject(name, shown, cameras, orbit_settings(stand)))
+        subjects.append(Subject(name, parts, cameras, orbit_settings(stand)))
     return subjects
+
+
+def read_camera_path(path: Path) -> tuple[list[Camera], int]:
+    """Read a camera path that nerfstudio's viewer has saved; raise ``UserError`` for another file or lens.
+
+    Returns the cameras, in the run's frame, and the frames per second.
+    """
+    try:
+        content = load_json(path)
+        width, height, fps = (content[name] for name in ("render_width", "render_height", "fps"))
+        if (lens := str(content.get("camera_type", "perspective")).lower()) != "perspective":
+            raise ValueError(f"its camera is {lens}, not perspective")
+        if not (min(width, height) >= 2 and max(width, height) <= _MOST_PIXELS and 1 <= fps <= 240):
+            raise ValueError(f"it asks for {width} x {height} pixels, {fps} times a second")
+        if not 1 <= len(content["camera_path"]) <= _MOST_CAMERAS:
+            raise ValueError(f"it has {len(content['camera_path'])} cameras")
+        poses = [torch.tensor(each["camera_to_world"]).view(4, 4)[:3].float() for each in content["camera_path"]]
+        focals = [height / 2.0 / math.tan(each["fov"] * (math.pi / 180.0) / 2.0) for each in content["camera_path"]]
+        if not (all(bool(pose.isfinite().all()) for pose in poses) and 0 < min(focals) < math.inf):
+            raise ValueError("a pose or a field of view is no number")
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, ArithmeticError) as error:
+        raise UserError(
+            f"the camera path {path} cannot be read ({reason(error)}): save one in the tab Render of ns-viewer."
+        ) from error
+    return [_camera(pose, focal, width, height) for pose, focal in zip(poses, focals, strict=True)], round(fps)
+
+
+def _camera(pose: torch.Tensor, focal: float, width: int, height: int) -> Camera:
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(viewmat_from_opengl(pose), K, int(width / 2 * 2), int(height / 2 * 2))

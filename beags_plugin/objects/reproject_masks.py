@@ -1,4 +1,4 @@
-"""Masks reprojected with the depth of a trained run: ``beags masks reproject``."""
+"""``beags masks reproject``: masks reprojected with the depth of a trained run."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class ReprojectionOptions:
     """Differences from the run's own preparation of masks; None keeps the run's choice.
 
     masks: folder of other id images. classes: their classes.json. method, tau, depth: see
-    ``preparation.pipeline.PreparationConfig``. run_size: reproject at the size of the training, not at that of the
-    photographs. parser: the options of ``beags-data``, if not the run's own. data: of the run, if not where they were.
+    ``preparation.pipeline.PreparationConfig``. run_size: reproject at the size of the training instead of the photos'.
+    parser: options of ``beags-data`` instead of the run's own. data: folder of the scene if it has moved.
     """
 
     masks: Path | None = None
@@ -55,8 +55,8 @@ class ReprojectionOptions:
 class ReprojectedRun:
     """The masks of V training views before and after, without lens distortion.
 
-    given, voted: class ids; given is None where a view has no mask. confidence: [H, W] uint8, share of the votes times
-    255. seconds: wall time. method: the reprojection. why: the reason for its choice, if it was not given.
+    given, voted: class ids; given is None for a view without a mask. confidence: [H, W] uint8, share of the votes times
+    255. seconds: wall time. method: of reprojection. why: the reason for its choice, or None if the user chose it.
     """
 
     scene: SavedScene
@@ -71,7 +71,7 @@ class ReprojectedRun:
     why: str | None
 
     def changed(self, view: int) -> Changed:
-        """Return one view for a picture."""
+        """Return a view's masks before and after, for a picture."""
         given = self.given[view]
         photo = self.manager.views("train")[view].image
         return Changed(
@@ -120,7 +120,7 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
 
 
 def data_to_reproject(run: Run, options: ReprojectionOptions) -> RunData:
-    """Return the data that a run was trained on, at the size and with the masks of ``options``."""
+    """Return the training data of a run, at the size and with the masks of ``options``."""
     config = run.config
     if options.parser is not None:
         parser = replace(options.parser)
@@ -140,49 +140,48 @@ def data_to_reproject(run: Run, options: ReprojectionOptions) -> RunData:
     return RunData(data, "val")
 
 
-def write_reprojection(found: ReprojectedRun, output: Path, min_confidence: float = 0.0) -> list[str]:
-    """Write the labels as masks, confidence maps, a report and a picture of the views that changed most; return a
-    summary.
+def write_reprojection(run: ReprojectedRun, output: Path, min_confidence: float = 0.0) -> list[str]:
+    """Write masks, confidence maps, a report and a picture of the views that changed most; return a summary.
 
-    All maps have the size of the photographs, lens distortion included, so that ``beags-data --masks-path`` takes them
-    (the run's own size on request). min_confidence: less certain pixels become IGNORE.
+    All maps have the size that ``reproject_run`` was given, and the photos' lens distortion, so that
+    ``beags-data --masks-path`` can read them. min_confidence: less certain pixels become IGNORE.
     """
     from PIL import Image
 
     with writing(output):
         changes = []
-        for index, path in enumerate(mask_paths(found.manager.train_dataset.image_filenames)):
-            voted = found.voted[index].numpy().astype(np.uint16)
-            confidence = found.confidence[index].numpy()
+        for index, path in enumerate(mask_paths(run.manager.train_dataset.image_filenames)):
+            voted = run.voted[index].numpy().astype(np.uint16)
+            confidence = run.confidence[index].numpy()
             doubtful = confidence < 255.0 * min_confidence
             final = np.where(doubtful, np.uint16(IGNORE), voted)
             for folder in ("masks", "confidence"):
                 (output / folder / path).parent.mkdir(parents=True, exist_ok=True)
-            files = found.manager.files["train"]
+            files = run.manager.files["train"]
             write_mask(output / "masks" / path, files.as_in_file(final, index))
             Image.fromarray(files.as_in_file(confidence, index, border=0)).save(output / "confidence" / path)
-            changes.append(_change(found, index, doubtful))
-        (output / "classes.json").write_text(json.dumps({str(i): name for i, name in found.classes.items()}, indent=1))
-        report = {"method": found.method, "seconds": found.seconds, "min_confidence": min_confidence, "views": changes}
+            changes.append(_change(run, index, doubtful))
+        (output / "classes.json").write_text(json.dumps({str(i): name for i, name in run.classes.items()}, indent=1))
+        report = {"method": run.method, "seconds": run.seconds, "min_confidence": min_confidence, "views": changes}
         (output / "report.json").write_text(json.dumps(report, indent=1))
         order = sorted(range(len(changes)), key=lambda index: -changes[index]["changed"])[:6]
-        before_and_after(output / "before_after.png", [found.changed(index) for index in order])
+        before_and_after(output / "before_after.png", [run.changed(index) for index in order])
     pixels, changed = (sum(view[key] for view in changes) for key in ("labelled", "changed"))
-    filled = sum(mask is None for mask in found.given.stored)
+    filled = sum(mask is None for mask in run.given.stored)
     return [
-        *([found.why] if found.why else []),
+        *([run.why] if run.why else []),
         f"{changed} of {pixels} labelled pixels changed ({100 * changed / max(pixels, 1):.2f} %), "
-        f"{filled} views without a mask got one, in {found.seconds:.1f} s",
+        f"{filled} views without a mask got one, in {run.seconds:.1f} s",
         *(f"{output / name}" for name in ("masks", "confidence", "classes.json", "report.json", "before_after.png")),
     ]
 
 
-def _change(found: ReprojectedRun, index: int, doubtful: np.ndarray) -> dict[str, object]:
-    given, voted = found.given[index], found.voted[index]
+def _change(run: ReprojectedRun, index: int, doubtful: np.ndarray) -> dict[str, object]:
+    given, voted = run.given[index], run.voted[index]
     known = None if given is None else given != IGNORE
-    confidence = found.confidence[index].float() / 255.0
+    confidence = run.confidence[index].float() / 255.0
     return {
-        "view": found.names[index],
+        "view": run.names[index],
         "labelled": 0 if known is None else int(known.sum()),
         "changed": 0 if known is None else int((known & (given != voted)).sum()),
         "mean_confidence": round(float(confidence.mean()), 4),
@@ -191,7 +190,7 @@ def _change(found: ReprojectedRun, index: int, doubtful: np.ndarray) -> dict[str
 
 
 def mask_paths(images: Sequence[Path]) -> list[Path]:
-    """Return the masks' paths below their folder, by which ``data.files.files_of_views`` finds them again."""
+    """Return the masks' paths below their folder, where ``data.files.files_of_views`` finds them."""
     stems = Counter(image.stem for image in images)
     if len(images) == 1 or max(stems.values()) == 1:
         return [Path(f"{image.stem}.png") for image in images]

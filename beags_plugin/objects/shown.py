@@ -1,4 +1,4 @@
-"""What the training views of a run on disk show: masks, depth of the whole scene, photos."""
+"""Training views of a run on disk: masks, depth of the whole scene, photos."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from beags_plugin.views.run_data import RunData
 from beags_plugin.views.streaming import Lazy
 from beags_plugin.views.views import View, unique_names
 
-MOST_VIEWS = 100  # evenly chosen ones; more would tell little more, and take longer
+MOST_VIEWS = 100  # views, evenly spread; more add little information, and take longer
 
 
 class Unshown(Exception):
-    """The masks or views of a run cannot be had; the message is a clause that says why."""
+    """The masks or views of a run are not available; the message is a clause that says why."""
 
 
 @dataclass(frozen=True)
 class ShownScene:
     """Training views of a run: at most ``MOST_VIEWS``.
 
-    names: of the views. views: their cameras, masks after reprojection and depth, in the frame of the run.
-    manager, chosen: where their photos are. exposures: of these; None where they have one.
+    names: of the views. views: their cameras, masks after reprojection and depth, in the frame of the run. manager,
+    chosen: the data that hold their photos, and which views these are. exposures: of the photos; None if all share one.
     """
 
     names: list[str]
@@ -43,25 +43,44 @@ class ShownScene:
 
     @cached_property
     def photos(self) -> list[View]:
-        """Return the views with their photos, which are read when this is first used."""
+        """Return the views with their photos, which are read when first used."""
         every = self.manager.views("train")
         return [every[index] for index in self.chosen]
+
+
+class Shown:
+    """The ``ShownScene`` of a run, made when it is first used."""
+
+    def __init__(self, run: Run) -> None:
+        self.run = run
+
+    @cached_property
+    def _scene_or_doubt(self) -> ShownScene | str:
+        try:
+            return shown_scene(self.run)
+        except Unshown as doubt:
+            return str(doubt)
+
+    def scene(self) -> tuple[ShownScene | None, str]:
+        """Return the scene, or None and why it is not available."""
+        scene = self._scene_or_doubt
+        return (None, scene) if isinstance(scene, str) else (scene, "")
 
 
 def shown_scene(run: Run) -> ShownScene:
     """Return what training views of a run show.
 
-    The depth of the whole scene is rendered once for each view, and kept on disk. Raises ``Unshown`` for a run whose
-    masks or data cannot be had.
+    The depth of the whole scene is rendered once for each view, and stored on disk. Raises ``Unshown`` for a run whose
+    masks or data are not available.
     """
     scene = run.scene
     if (run.folder / EXTRACTION_FILE).exists():
-        raise Unshown("the run is part of a scene, which does not show what hides it")
+        raise Unshown("the run is part of a scene, without the objects that may hide it")
     if scene.picked:
-        raise Unshown("its objects were picked in the viewer, and the masks that the run has kept are of others")
+        raise Unshown("its objects were picked in the viewer, and the masks saved in the run are of others")
     folder = preparing_run(run.folder) / PREPARED
     if not (folder / "grid.pt").exists():
-        raise Unshown("the run has kept no masks")
+        raise Unshown("the run has no saved masks")
     try:
         manager = run.views("val")
     except UserError as error:
@@ -78,7 +97,7 @@ def shown_scene(run: Run) -> ShownScene:
     except UserError:
         fit = False
     if not fit:
-        raise Unshown("the masks that the run has kept do not fit its data")
+        raise Unshown("the masks saved in the run do not fit its data")
     labels = Lazy(lambda index: prepared_labels(files[index], cameras[index]), len(files))
     rasterizer, settings = run.rasterizer, run.settings
     with progress_bar("Rendering depth", passing=True) as progress:

@@ -1,4 +1,4 @@
-"""A scene of another program after refinement: written back in the format that it came in, and what changed."""
+"""Write a refined scene of another program back in its own format, and count what changed."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from beags_plugin.importers.base import ImportedScene
 from beags_plugin.objects.export import export_run
 from beags_plugin.splat_io.files import whole_file
 
-_SPLIT = 2.0  # standard deviations from a Gaussian within which its halves lie
+_SPLIT = 2.0  # distance, in standard deviations of a Gaussian, within which its halves lie
 
 
 @dataclass(frozen=True)
 class FileFormat:
-    """An exporter and its options; note: a sentence where the format that a scene came in cannot be written, or ""."""
+    """An exporter and its options. note: a sentence if the scene's own format cannot be written, else ""."""
 
     exporter: str
     options: dict[str, Any]
@@ -44,12 +44,10 @@ def format_of(path: Path, scene: ImportedScene) -> FileFormat:
     names |= {".sog": "sog", ".sog of discs": "sog", ".splat": "splat", "glTF of splats": "gltf-splats"}
     if (name := names.get(kind)) is not None:
         return FileFormat(name, {})
-    return FileFormat("ply", {}, f"A {kind} is not written, so a .ply of 3DGS is.")
+    return FileFormat("ply", {}, f"A {kind} cannot be written, so a .ply of 3DGS is.")
 
 
-def write_back(
-    config_path: Path, wanted: FileFormat, folder: Path, stem: str, objects: Sequence[str], data: Path | None = None
-) -> list[Path]:
+def write_back(config_path: Path, wanted: FileFormat, folder: Path, stem: str, objects: Sequence[str]) -> list[Path]:
     """Write the whole scene of a refined run to ``folder``, and each of some objects beside it; return the files.
 
     The scene is called ``stem``.cleaned, an object ``stem``.NAME; both lie in the world of the input poses.
@@ -59,11 +57,11 @@ def write_back(
     with tempfile.TemporaryDirectory() as made:
         exported = export_run(
             config_path, objects, formats=[wanted.exporter], output=Path(made), whole=True,
-            options={wanted.exporter: wanted.options}, data=data,
+            options={wanted.exporter: wanted.options},
         )  # fmt: skip
         for one in exported:
             (file,) = one.files
-            assert file.path is not None  # what cannot be written raises
+            assert file.path is not None  # export_run raises for what it cannot write
             title = "cleaned" if one.class_id is None else file.path.name.removesuffix(f".{suffix}")
             target = folder / f"{stem}.{title}.{suffix}"
             with whole_file(target) as part:
@@ -74,11 +72,11 @@ def write_back(
 
 @dataclass(frozen=True)
 class Changes:
-    """What refinement did to N Gaussians, of which M are left or new.
+    """Numbers of Gaussians before and after refinement.
 
-    kept: pairs that are each other's nearest. moved: of these, by more than the Gaussian's own larger scale. median: of
-    their way over that scale. split: Gaussians that are gone, in whose place new ones lie. dropped: others that are
-    gone. new: those after that are no former ones.
+    kept: pairs that are each other's nearest. moved: of these, pairs that moved by more than the Gaussian's larger
+    scale. median: of the distances over that scale. split: removed Gaussians with new ones in their place. dropped:
+    other removed Gaussians. new: Gaussians after refinement that are in no pair.
     """
 
     before: int
@@ -101,8 +99,8 @@ class Changes:
 def changes(before: Surfels, after: Surfels) -> Changes:
     """Compare two states of one scene.
 
-    Nothing numbers Gaussians across splits: those that are each other's nearest by their means count as the same. One
-    that is gone was split if a new one lies within two standard deviations of its larger scale.
+    Gaussians have no ids, so those whose means are each other's nearest count as the same. A removed one was split if a
+    new one lies within two standard deviations of its larger scale.
     """
     from scipy.spatial import KDTree
 

@@ -1,18 +1,18 @@
-"""The cut: which Gaussians of a trained scene belong to an object that a few prompts point at.
+"""Cut an object out of a trained scene: choose its Gaussians from a few prompts.
 
 After GaussianCut (Jain, Mirzaei, Gilitschenski, "GaussianCut: Interactive Segmentation via Graph Cut for 3D Gaussian
-Splatting", NeurIPS 2024), which cuts a graph of the Gaussians too, but knows the object from masks of many views. Here
-a few marks reach over the surface: with p of ``walk.Walker``, its level t and the weights of ``graph``, the object
-minimises
+Splatting", NeurIPS 2024), which also cuts a graph of the Gaussians, but takes the object from masks of many views.
+Here a few marks spread over the surface: with p and the level t of ``walk.Walker`` and the weights of ``graph``, the
+object minimises
 
     E = sum_{i in object} [a_i]- + sum_{i not in it} [a_i]+ + sum_{links between both} w_ij,
     a_i = 0.3 (logit p_i - logit t + g),
 
-where g is how much it shall grow, and a Gaussian that a mark shows, or that is excluded, is bound to its side. Walks
-end more often on the tangent planes of what marks show beside the object (a floor goes on in a ring's hole, which no
-walk reaches), and p is 0 where a walk meets marks beside the object more surely than those on it. Neither holds for
-marks on other objects: the object's walks end there, those from marks beside it pass, as what marks on other objects
-meet more surely may still be this object.
+where g is the growth that the user asks for. A Gaussian that a mark shows, or that is excluded, is bound to its side.
+Marks beside the object have two more effects: walks end more often on the tangent planes of what they show (such as the
+floor in the hole of a ring, which no walk reaches), and p is 0 where a walk is more likely to meet them than marks on
+the object. Marks on other objects have neither effect: the object's walks end there, but walks from marks beside it
+pass, as a Gaussian nearer to another object's mark may still belong to this object.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system.errors import UserError
 
-LEAST_SHARE = 0.1  # of the light of a mark: a Gaussian that gives less is not what the mark shows,
-LEAST_OF_LARGEST = 0.5  # but if none gives so much, those that give half of the most,
-LEAST_LIGHT = 0.02  # unless it is next to nothing
-LEAST_OWN = 0.5  # of that light from Gaussians which no mark of the other kind shows better
-BELIEF = 0.3  # of the logit of p, beside links of at most 1
-BOUND = 1e3  # more than all links of a Gaussian can be worth
-NOTHING = -30.0  # logit of an opacity that no picture shows
-MUCH = 0.5  # of the scene: a cut that takes more may be right, but is said
-LITTLE, FEW = 0.002, 100  # of the scene, and Gaussians: a cut that takes less of both is said too
-LIMIT = 1e-6  # of p, so that its logit is finite
+# A mark shows a Gaussian that gives at least LEAST_SHARE of the mark's light; if none does, those that give at least
+# LEAST_OF_LARGEST of the largest share, and at least LEAST_LIGHT.
+LEAST_SHARE, LEAST_OF_LARGEST, LEAST_LIGHT = 0.1, 0.5, 0.02
+LEAST_OWN = 0.5  # least share of that light from Gaussians that no mark of the other kind shows better
+BELIEF = 0.3  # weight of logit p, beside links of at most 1
+BOUND = 1e3  # more than the sum of all links of a Gaussian
+NOTHING = -30.0  # logit of an invisible opacity
+MUCH = 0.5  # share of the scene above which a cut is reported as large
+LITTLE, FEW = 0.002, 100  # share of the scene, and number of Gaussians, below both of which a cut is reported as small
+LIMIT = 1e-6  # bound of p that keeps its logit finite
 
 
 def takes_much(members: Tensor) -> str | None:
-    """Return what to say of a cut, [N] bool, that takes more than half of a scene, or None."""
+    """Return a note on a cut, [N] bool, that takes more than half of a scene, or None."""
     share = float(members.double().mean())
     if share <= MUCH:
         return None
@@ -59,7 +59,7 @@ def takes_much(members: Tensor) -> str | None:
 
 
 def takes_little(members: Tensor) -> str | None:
-    """Return what to say of a cut, [N] bool, that has hardly left its points, or None."""
+    """Return a note on a cut, [N] bool, that takes little more than its points, or None."""
     count = int(members.sum())
     if count >= min(FEW, LITTLE * len(members)):
         return None
@@ -68,12 +68,12 @@ def takes_little(members: Tensor) -> str | None:
 
 @dataclass(frozen=True)
 class ViewMarks:
-    """What a user has marked in one view without lens distortion.
+    """A user's marks in one view without lens distortion.
 
-    name: of the view, for errors. numbers: [h, w] int32, at a marked pixel the number of its mark, else IGNORE.
-    inside: per mark whether it lies on the object. within: [h, w] bool, False where a box says that the object is not,
-    or None. of_others: whether the marks lie on other objects, and so all beside this one. drawn: [N] bool, the
-    Gaussians that the view shows, or None for all.
+    name: of the view, for errors. numbers: [h, w] int32, the number of the mark at a marked pixel, else IGNORE. inside:
+    for each mark, whether it lies on the object. within: [h, w] bool, False outside the user's box, or None without a
+    box. of_others: whether the marks lie on other objects, and so all beside this one. drawn: [N] bool, the Gaussians
+    that the view shows, or None for all.
     """
 
     name: str
@@ -86,9 +86,9 @@ class ViewMarks:
 
 
 class Cutter:
-    """Cuts objects out of one scene; what the cuts share is made once.
+    """Cuts objects out of one scene; the graph that all cuts share is built once.
 
-    surfels: N Gaussians. cameras: the views that have seen the scene. progress: receives (done, total) of them.
+    surfels: N Gaussians. cameras: of the training views. progress: receives (done, total) views.
     """
 
     def __init__(
@@ -115,12 +115,12 @@ class Cutter:
         growth: float = 0.0,
         part: bool = False,
     ) -> Tensor:
-        """Return which Gaussians belong to the object, [N] bool on the CPU; the same whatever was solved before.
+        """Return which Gaussians belong to the object, [N] bool on the CPU; earlier calls do not matter.
 
-        excluded: [N] bool, Gaussians that do not, or None. name: of the object, for errors. growth: g; a larger one
-        takes the same Gaussians and more, a negative one fewer. part: whether the object is not all of what is neither
-        excluded nor outside of a box. Raises ``UserError`` if no mark lies on the object or on a Gaussian, if marks
-        contradict one another, or if no Gaussian belongs to it, or all do.
+        excluded: [N] bool, Gaussians that do not belong to it, or None. name: of the object, for errors. growth: g; a
+        larger one adds Gaussians, a negative one removes some. part: whether the object must be less than all
+        Gaussians that are neither excluded nor outside a box. Raises ``UserError`` if no mark lies on the object or on
+        a Gaussian, if marks contradict each other, or if the object has no Gaussian or all of them.
         """
         if not any(inside for view in marks for inside in view.inside):
             raise UserError(f"no point lies on {name}: give at least one in a view that shows it.")
@@ -131,7 +131,7 @@ class Cutter:
         barred = outside[nodes]
         inside, beside, ground = self._bound(marks, barred, name)
         behind = self._graph.on_plane_of(ground) & ~self._graph.on_plane_of(inside)
-        with ThreadPoolExecutor() as threads:  # both walks at once: their products hold no lock
+        with ThreadPoolExecutor() as threads:  # both walks run at once, as their products hold no lock
             walk = threads.submit(self._walker.potential, inside, beside, barred, behind)
             nearer = self._walker.potential(ground, inside, barred, np.zeros_like(behind)) if ground.any() else 0.0
             p = walk.result()
@@ -139,24 +139,24 @@ class Cutter:
         ends = self._graph.first, self._graph.second
         weights = np.where(barred[ends[0]] | barred[ends[1]], 0.0, self._graph.weights)
         level = self._walker.border_level(p, weights, part)
-        found = self._minimum(p, level, growth, weights, inside, beside | barred)
-        if found.all():
+        side = self._minimum(p, level, growth, weights, inside, beside | barred)
+        if side.all():
             raise UserError(f"the cut of {name} takes the whole scene: mark points beside it, or draw a box about it.")
-        members = found[self._graph.nearest] & ~outside
+        members = side[self._graph.nearest] & ~outside
         if not members.any():
             raise UserError(f"the cut of {name} takes nothing: mark points on it that no box or limit leaves out.")
         return torch.from_numpy(members)
 
     def outside(self, marks: Sequence[ViewMarks]) -> Tensor:
-        """Return which Gaussians lie outside of a box of the marks, [N] bool on the CPU."""
-        found = np.zeros(len(self._inputs.means), dtype=bool)
+        """Return which Gaussians lie outside a box of the marks, [N] bool on the CPU."""
+        outside = np.zeros(len(self._inputs.means), dtype=bool)
         for view in marks:
             if view.within is not None:
-                found |= ~self._shown_within(view)
-        return torch.from_numpy(found)
+                outside |= ~self._shown_within(view)
+        return torch.from_numpy(outside)
 
     def shown_share(self, view: ViewMarks, among: Tensor) -> float:
-        """Return the share of the light of a view's marks that comes from Gaussians ``among`` [N] bool; 0 without."""
+        """Return the share of the light of a view's marks that Gaussians ``among`` [N] bool give; 0 without light."""
         light = self._shares(view).sum(axis=0)
         return float(light[among.cpu().numpy()[self._graph.nodes]].sum() / max(light.sum(), 1e-12))
 
@@ -169,7 +169,7 @@ class Cutter:
         inside: np.ndarray,
         beside: np.ndarray,
     ) -> np.ndarray:
-        """Return the side of the object, [M] bool; ``inside`` and ``beside`` are bound to theirs."""
+        """Return which nodes the cut gives to the object, [M] bool; ``inside`` and ``beside`` are bound."""
         p, t = p.clip(LIMIT, 1.0 - LIMIT), min(max(level, LIMIT), 1.0 - LIMIT)
         belief = BELIEF * (np.log(p / (1.0 - p)) - np.log(t / (1.0 - t)) + growth)
         belief[inside], belief[beside] = BOUND, -BOUND
@@ -179,11 +179,10 @@ class Cutter:
     def _bound(
         self, marks: Sequence[ViewMarks], excluded: np.ndarray, name: str
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the nodes that the marks bind to the object and to the rest, disjoint [M] bool.
+        """Return the nodes bound to the object, those bound to the rest, and the ground; each [M] bool.
 
-        Third come those bound to the rest that marks which lie on no other object show.
-
-        A Gaussian belongs to the kind of mark of which it gives the larger share of the light.
+        The first two are disjoint: a node is bound to the kind of mark of which it gives the larger share of the light.
+        The ground are nodes of the rest shown by marks that do not lie on other objects.
         """
         shares = np.zeros((2, len(excluded)))
         ground = np.zeros_like(excluded)
@@ -213,22 +212,22 @@ class Cutter:
         count, inputs = len(view.inside), self._inputs
         if count == 0:
             return np.zeros((0, len(self._graph.nodes)))
-        if view.drawn is not None:  # what cannot be seen stops no light
+        if view.drawn is not None:  # an invisible Gaussian stops no light
             unseen = ~view.drawn.to(inputs.means.device)
             inputs = replace(inputs, opacity_logits=inputs.opacity_logits.masked_fill(unseen, NOTHING))
-        numbers = view.numbers.to(inputs.means.device)  # marks are made on the CPU
+        numbers = view.numbers.to(inputs.means.device)  # marks come from the CPU
         with torch.no_grad():
             keys, weights = self._rasterizer.sparse_class_contributions(
                 inputs, view.camera, self._settings, numbers, count
             )
         pixels = torch.bincount(view.numbers[view.numbers != IGNORE].long(), minlength=count).double().cpu().numpy()
-        found = np.zeros((count, len(self._inputs.means)))
+        light = np.zeros((count, len(self._inputs.means)))
         index = keys.cpu().numpy()
-        found[index % count, index // count] = weights.double().cpu().numpy()
-        return found[:, self._graph.nodes] / pixels.clip(1)[:, None]
+        light[index % count, index // count] = weights.double().cpu().numpy()
+        return light[:, self._graph.nodes] / pixels.clip(1)[:, None]
 
     def _shown_within(self, view: ViewMarks) -> np.ndarray:
-        """Return which Gaussians have their centre before the camera and in the view's box, [N] bool."""
+        """Return which Gaussians have their centre in front of the camera and in the view's box, [N] bool."""
         assert view.within is not None
         camera = view.camera.host
         means = self._inputs.means.double().cpu()
@@ -238,6 +237,6 @@ class Cutter:
         pixel = torch.nan_to_num(projected[:, :2] / depth[:, None], nan=-1.0, posinf=-1.0, neginf=-1.0).floor()
         column, row = pixel[:, 0], pixel[:, 1]
         shown = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        found = torch.zeros(len(means), dtype=torch.bool)
-        found[shown] = view.within.cpu()[row[shown].long(), column[shown].long()]
-        return found.numpy()
+        within = torch.zeros(len(means), dtype=torch.bool)
+        within[shown] = view.within.cpu()[row[shown].long(), column[shown].long()]
+        return within.numpy()

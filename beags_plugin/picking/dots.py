@@ -1,4 +1,4 @@
-"""Dot products whose sums have one order, whatever the number of threads; those of a BLAS have not."""
+"""Dot products. Determinism: unlike those of a BLAS, sums have one order for any number of threads."""
 
 from __future__ import annotations
 

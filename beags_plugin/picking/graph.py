@@ -1,19 +1,19 @@
 """The graph of a scene's surface: near Gaussians are linked, strongly if nothing between them looks like a border.
 
 Between touching solids a surface has a concave crease (Stein, Schoeler, Papon, Woergoetter, "Object Partitioning using
-Local Convexity", CVPR 2014), or a step from one sheet to another in front of it; within one solid it is flat or convex.
-Of linked Gaussians i and j, mu is the centre, n the normal towards the cameras, c the colour of degree 0, and
-u = (mu_j - mu_i) / |mu_j - mu_i|. The link weighs
+Local Convexity", CVPR 2014), or a step to another sheet in front of it; within one solid it is flat or convex. For
+linked Gaussians i and j, mu is the centre, n the normal towards the cameras, c the colour of degree 0, and
+u = (mu_j - mu_i) / |mu_j - mu_i|. The link has the weight
 
     w_ij = 1e-5 + exp(-(30 [(n_i - n_j) . u]+^2 + 0.5 [(n_j - n_i) . u]+^2 + 30 ((n_i + n_j) . u / 2)^2
                         + 2 |c_i - c_j|^2 + 0.2 |mu_i - mu_j| / s))
 
-with a concave crease, a convex one, a step (0 on a round surface, whose mean normal is square to each chord), the
-colours, and the distance in units of s, the median one.
+The terms are for a concave crease, a convex crease, a step (0 on a round surface, whose mean normal is perpendicular to
+each chord), the colours, and the distance in units of s, the median distance.
 
-Gaussians are smaller where there is more to see, as at contacts. If they lie half as far apart, twice as many links
-cross a border and four times as many Gaussians lie within; so a cut link stands for sqrt(l_i l_j) of a border's length,
-and a Gaussian for l_i^2 of the area, where l_i is the mean length of its links in s.
+Gaussians are smaller where there is more detail, as at contacts. At half the distance, twice as many links cross a
+border and four times as many Gaussians lie within it; so a cut link counts as sqrt(l_i l_j) of a border's length, and a
+Gaussian as l_i^2 of the area, where l_i is the mean length of its links in s.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.picking.dots import dots
 
 NEIGHBOURS = 10
-LEAST_WEIGHT = 0.3  # pixels over all views: less than this is no part of a surface that anybody sees
+LEAST_WEIGHT = 0.3  # least weight over all views, in pixels, of a Gaussian of the visible surface
 CONCAVE, CONVEX, STEP, COLOR, DISTANCE = 30.0, 0.5, 30.0, 2.0, 0.2
-PLANE_HEIGHT, PLANE_SLOPE, PLANE_COSINE = 0.5, 0.02, 0.95  # in s, per unit of distance, of the angle of normals
-FLOOR = 1e-5  # so that no seed's reach ends at a noisy normal
-SHORTEST, LONGEST = 0.1, 3.0  # of l: neither twins nor a Gaussian far from all others shall decide
-SMOOTHING_ROUNDS, SMOOTHING_POWER = 2, 8  # neighbours turned by more than 30 degrees have a third of the say or less
+# Bounds of points on a tangent plane: height in s, height per unit of distance, least cosine between normals.
+PLANE_HEIGHT, PLANE_SLOPE, PLANE_COSINE = 0.5, 0.02, 0.95
+FLOOR = 1e-5  # least weight of a link, so that a noisy normal stops no walk
+SHORTEST, LONGEST = 0.1, 3.0  # bounds of l, so that neither coincident nor isolated Gaussians dominate
+SMOOTHING_ROUNDS, SMOOTHING_POWER = 2, 8  # neighbours turned by 30 degrees have a third of the weight
 
 
 @dataclass(frozen=True)
 class SurfaceGraph:
     """The linked Gaussians of a scene of N.
 
-    nodes: [M] int64, the Gaussians that cameras see, ascending. nearest: [N] int64, of each Gaussian the node that is
-    nearest to it, itself if it is one. first, second: [P] int64, nodes that are linked, each pair once.
-    weights, lengths: [P] float64, w_ij and sqrt(l_i l_j). areas: [M] float64, l_i^2. centres, normals: [M, 3] float64,
-    of the nodes, in the scene's units and unit vectors.
-    spacing: s, scene units.
+    nodes: [M] int64, the Gaussians that cameras see, ascending. nearest: [N] int64, the node nearest to each Gaussian,
+    itself for a node. first, second: [P] int64, linked nodes, each pair once. weights, lengths: [P] float64, w_ij and
+    sqrt(l_i l_j). areas: [M] float64, l_i^2. centres: [M, 3] float64, scene units. normals: [M, 3] float64, unit
+    vectors. spacing: s, scene units.
     """
 
     nodes: np.ndarray
@@ -61,15 +61,15 @@ class SurfaceGraph:
     def on_plane_of(self, chosen: np.ndarray) -> np.ndarray:
         """Return which nodes lie on the tangent plane of one of the nodes ``chosen`` [M] bool, [M] bool.
 
-        A plane's error grows with the distance, by that of the normal.
+        The tolerance grows with the distance, because of the normal's error.
         """
-        found = chosen.copy()
+        on_plane = chosen.copy()
         for centre, normal in zip(self.centres[chosen], self.normals[chosen], strict=True):
             between = self.centres - centre
             height = np.abs(dots(between, normal))
             limit = PLANE_HEIGHT * self.spacing + PLANE_SLOPE * np.sqrt(dots(between, between))
-            found |= (height < limit) & (dots(self.normals, normal) > PLANE_COSINE)
-        return found
+            on_plane |= (height < limit) & (dots(self.normals, normal) > PLANE_COSINE)
+        return on_plane
 
 
 def surface_graph(surfels: Surfels, seen: np.ndarray, normals: np.ndarray) -> SurfaceGraph:
@@ -102,8 +102,8 @@ def surface_graph(surfels: Surfels, seen: np.ndarray, normals: np.ndarray) -> Su
     spacing = max(float(np.median(lengths)) if len(lengths) else 1.0, 1e-30)
     weights = link_weights(centres / spacing, smooth, colors.clamp(0.0, 1.0).numpy()[nodes], first, second)
     own = mean_lengths(lengths / spacing, first, second, count)
-    stand_for = np.sqrt(own[first] * own[second])
-    return SurfaceGraph(nodes, nearest, first, second, weights, stand_for, own**2, centres, smooth, spacing)
+    cut_lengths = np.sqrt(own[first] * own[second])
+    return SurfaceGraph(nodes, nearest, first, second, weights, cut_lengths, own**2, centres, smooth, spacing)
 
 
 def mean_lengths(lengths: np.ndarray, first: np.ndarray, second: np.ndarray, count: int) -> np.ndarray:
@@ -114,15 +114,15 @@ def mean_lengths(lengths: np.ndarray, first: np.ndarray, second: np.ndarray, cou
 
 
 def smoothed(normals: np.ndarray, seen: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return unit normals [M, 3] averaged over linked Gaussians that face alike, by the root of their weight seen."""
+    """Return unit normals [M, 3] averaged over linked Gaussians that face alike, weighted by sqrt(``seen``)."""
     from scipy.sparse import csr_array
 
-    count, say = len(normals), np.sqrt(seen)
+    count, root = len(normals), np.sqrt(seen)
     rows = np.concatenate([first, second, np.arange(count)])
     columns = np.concatenate([second, first, np.arange(count)])
     for _ in range(SMOOTHING_ROUNDS):
         alike = dots(normals[first], normals[second]).clip(0.0, 1.0) ** SMOOTHING_POWER
-        values = np.concatenate([alike * say[second], alike * say[first], say])
+        values = np.concatenate([alike * root[second], alike * root[first], root])
         mixed = np.asarray(csr_array((values, (rows, columns)), shape=(count, count)) @ normals)
         normals = mixed / np.sqrt(dots(mixed, mixed))[:, None].clip(1e-12)
     return normals
@@ -131,7 +131,7 @@ def smoothed(normals: np.ndarray, seen: np.ndarray, first: np.ndarray, second: n
 def link_weights(
     centres: np.ndarray, normals: np.ndarray, colors: np.ndarray, first: np.ndarray, second: np.ndarray
 ) -> np.ndarray:
-    """Return w_ij [P] of links between M Gaussians; centres in units of s, unit normals, colors (0..1): [M, 3]."""
+    """Return w_ij [P] of links between M Gaussians. centres (in s), normals (unit), colors (0..1): [M, 3]."""
     between = centres[second] - centres[first]
     lengths = np.sqrt(dots(between, between))
     direction = between / lengths.clip(1e-12)[:, None]

@@ -1,4 +1,4 @@
-"""Objects picked one after another: every step gives another list of them, so that each can be undone."""
+"""Objects picked one after another; every step returns a new list of them, so that each can be undone."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.picking.cutter import Cutter, ViewMarks
 from beags_plugin.system.errors import UserError
 
-GROWTH = 0.35  # of one step, in the logit of ``Cutter.solve``: what walks reach with a third less chance comes too
-ON_IT = 0.5  # of the light of a mark: it lies on what gives so much
+GROWTH = 0.35  # growth of one step, in the logit of ``Cutter.solve``: it adds what walks reach a third less often
+ON_IT = 0.5  # least share of a mark's light that an object gives if the mark lies on it
 
 
 @dataclass(frozen=True)
 class Picked:
     """One object, picked or corrected.
 
-    marks: in the order in which they were made. growth: steps of ``GROWTH``. members: [N] bool, what was cut; None
-    before the first mark. class_id, start: of the object of a run that is corrected, and its Gaussians before, [N]
-    bool; None for a new object.
+    marks: in the order in which they were made. growth: steps of ``GROWTH``. members: [N] bool, the cut; None before
+    the first mark. class_id: of the run's object that is corrected; None for a new object. start: [N] bool, the
+    Gaussians of that object before; None for a new object.
     """
 
     name: str
@@ -41,22 +41,22 @@ class Picked:
 
 @dataclass(frozen=True)
 class Picks:
-    """The objects, and the place of the one that the next mark is about; every method returns others."""
+    """The objects, and the place of the one that the next mark belongs to; every method returns new ``Picks``."""
 
     objects: tuple[Picked, ...] = (Picked("object 1"),)
     place: int = 0
 
     @property
     def chosen(self) -> Picked:
-        """Return the object that the next mark is about."""
+        """Return the object that the next mark belongs to."""
         return self.objects[self.place]
 
     def marked(self, cutter: Cutter, mark: ViewMarks) -> Picks:
-        """Cut the object again, with one more mark; raises ``UserError`` as ``Cutter.solve`` does."""
+        """Cut the object again, with one more mark; raise ``UserError`` as ``Cutter.solve`` does."""
         return self._cut(cutter, replace(self.chosen, marks=(*self.chosen.marks, mark)))
 
     def grown(self, cutter: Cutter, steps: int) -> Picks:
-        """Cut the object again, larger by so many steps, or smaller; raises ``UserError`` without a mark."""
+        """Cut the object again, larger by some steps, or smaller; raise ``UserError`` without a mark."""
         if not self.chosen.marks:
             raise UserError(f"nothing of {self.chosen.name} has been picked yet: click on it first.")
         return self._cut(cutter, replace(self.chosen, growth=self.chosen.growth + steps))
@@ -66,7 +66,7 @@ class Picks:
         return self._with(replace(self.chosen, name=name))
 
     def another(self) -> Picks:
-        """Begin another object, unless there is one that has no mark yet."""
+        """Begin another object, or go on with one that has no mark yet."""
         for place, one in enumerate(self.objects):
             if not one.marks and one.class_id is None:
                 return replace(self, place=place)
@@ -75,7 +75,7 @@ class Picks:
         return Picks((*self.objects, Picked(name)), len(self.objects))
 
     def correcting(self, name: str, class_id: int, start: Tensor) -> Picks:
-        """Go on with an object of the run, whose Gaussians are ``start`` [N] bool."""
+        """Correct an object of the run, whose Gaussians are ``start`` [N] bool."""
         for place, one in enumerate(self.objects):
             if one.class_id == class_id:
                 return replace(self, place=place)
@@ -83,7 +83,7 @@ class Picks:
         return Picks((*self.objects, one), len(self.objects))
 
     def choose(self, place: int) -> Picks:
-        """Go on with another of the objects."""
+        """Choose another object."""
         return replace(self, place=place)
 
     def changed(self) -> list[Picked]:
@@ -91,11 +91,11 @@ class Picks:
         return [one for one in self.objects if one.changed]
 
     def applied(self, members: Membership, names: Mapping[int, str]) -> tuple[Membership, dict[int, str]]:
-        """Return the classes of N Gaussians once all is picked, and their names.
+        """Return the classes of N Gaussians after picking, and the classes' names.
 
-        members, names: as before. New objects get new ids, or that of a class of their name without Gaussians. What
-        several of the picked ones hold is the smallest one's (``_smallest_last``), and what was taken from an object is
-        the background's. Raises ``UserError`` if nothing was picked, and for a name that is empty or another object's.
+        members, names: before picking. A new object gets a new id, or that of a class of its name without Gaussians.
+        Gaussians of several picked objects go to the smallest one (``_smallest_last``); those taken from an object
+        become background. Raises ``UserError`` if nothing was picked, and for an empty or repeated name.
         """
         changed = self.changed()
         if not changed:
@@ -107,11 +107,11 @@ class Picks:
             assert one.members is not None
             name = one.name.strip()
             if not name or not name.isprintable():
-                raise UserError("an object has no name: give it one, of plain text on one line.")
+                raise UserError("an object has no name: give it one line of plain text.")
             free = [each for each, other in given.items() if other == name and each not in there | set(masks)]
             class_id = (free or [max(given) + 1])[0] if one.class_id is None else one.class_id
             if name in (other for each, other in given.items() if each != class_id):
-                raise UserError(f"there are two objects called {name!r}: name one of them otherwise.")
+                raise UserError(f"there are two objects called {name!r}: rename one of them.")
             given[class_id] = name
             masks[class_id] = one.members
         taken = torch.zeros(len(members), dtype=torch.bool)
@@ -120,12 +120,12 @@ class Picks:
         return _with_masks(members, masks), given
 
     def owners(self, count: int) -> Tensor:
-        """Return [count] int64, the place of the smallest object that holds each Gaussian; -1: none."""
-        found = torch.full((count,), -1, dtype=torch.int64)
+        """Return the place of the smallest object that holds each of ``count`` Gaussians, [N] int64; -1 for none."""
+        owners = torch.full((count,), -1, dtype=torch.int64)
         masks = {place: one.members for place, one in enumerate(self.objects) if one.members is not None}
         for place in _smallest_last(masks):
-            found[masks[place]] = place
-        return found
+            owners[masks[place]] = place
+        return owners
 
     def _with(self, one: Picked) -> Picks:
         return replace(self, objects=(*self.objects[: self.place], one, *self.objects[self.place + 1 :]))
@@ -137,22 +137,26 @@ class Picks:
             for mark in other.marks
             if place != self.place and all(mark.inside)
         ]
-        cut = _cut_new if one.start is None else _corrected
-        return self._with(replace(one, members=cut(cutter, one, [mark for mark in others if mark.inside])))
+        others = [mark for mark in others if mark.inside]
+        return self._with(replace(one, members=_members(cutter, one, others)))
 
 
 def _smallest_last(masks: Mapping[int, Tensor]) -> list[int]:
-    """Return the keys of masks [N] bool by falling size, those of one size in their order: the last one wins."""
+    """Return the keys of masks [N] bool by descending size, equal ones in their order."""
     return sorted(masks, key=lambda each: -int(masks[each].sum()))
 
 
-def _cut_new(cutter: Cutter, one: Picked, others: Sequence[ViewMarks]) -> Tensor:
-    return cutter.solve([*one.marks, *others], name=one.name, growth=GROWTH * one.growth)
+def _members(cutter: Cutter, one: Picked, others: Sequence[ViewMarks]) -> Tensor:
+    """Return the Gaussians of an object [N] bool.
 
+    A corrected object loses the parts shown by marks beside it, and gains those shown by marks on it.
+    """
 
-def _corrected(cutter: Cutter, one: Picked, others: Sequence[ViewMarks]) -> Tensor:
-    """Return the Gaussians that an object had, without the parts that marks beside it show, and with those on it."""
-    assert one.start is not None
+    def added() -> Tensor:
+        return cutter.solve([*one.marks, *others], name=one.name, growth=GROWTH * one.growth)
+
+    if one.start is None:
+        return added()
     members = one.start
     on = [mark for mark in one.marks if any(mark.inside)]
     beside = [mark for mark in one.marks if mark.inside and not any(mark.inside)]
@@ -164,9 +168,9 @@ def _corrected(cutter: Cutter, one: Picked, others: Sequence[ViewMarks]) -> Tens
         name = f"what is taken from {one.name}"
         members = members & ~cutter.solve(flipped, ~members, name, -GROWTH * one.growth, part=True)
     elif not on and not bool((outside & members).any()):
-        raise UserError(f"nothing of {one.name} is there: click on what shall be taken from it.")
+        raise UserError(f"nothing of {one.name} is there: click on the part that you want to take from it.")
     if on:
-        members = members | cutter.solve([*one.marks, *others], name=one.name, growth=GROWTH * one.growth)
+        members = members | added()
     members = members & ~outside
     if not members.any():
         raise UserError(f"nothing would be left of {one.name}: take less from it.")
@@ -174,7 +178,7 @@ def _corrected(cutter: Cutter, one: Picked, others: Sequence[ViewMarks]) -> Tens
 
 
 def _with_masks(members: Membership, masks: Mapping[int, Tensor]) -> Membership:
-    """Return the classes once those of ``masks`` (id to [N] bool) are as given."""
+    """Return the classes with the Gaussians of ``masks`` (id to [N] bool) replaced."""
     device = members.class_ids.device
     taken = torch.stack([mask.to(device) for mask in masks.values()]).any(dim=0)
     class_ids = torch.where(
@@ -185,6 +189,7 @@ def _with_masks(members: Membership, masks: Mapping[int, Tensor]) -> Membership:
     class_ids = class_ids.to(members.class_ids.dtype)
     if members.objects is None:
         return Membership(class_ids)
-    kept = {each: index for each, index in members.objects.items() if each not in masks}
-    left = {each: index[~taken.to(index.device)[index]] for each, index in kept.items()}
-    return Membership(class_ids, left | {each: mask.nonzero()[:, 0] for each, mask in masks.items()})
+    others = {
+        each: index[~taken.to(index.device)[index]] for each, index in members.objects.items() if each not in masks
+    }
+    return Membership(class_ids, others | {each: mask.nonzero()[:, 0] for each, mask in masks.items()})

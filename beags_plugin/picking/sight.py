@@ -1,4 +1,4 @@
-"""What the cameras see of each Gaussian: how much of it, and from which of its two sides."""
+"""How much the cameras see of each Gaussian, and from which of its two sides."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from beags_plugin.picking.dots import dots
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
 
-MOST_VIEWS = 64  # more add little: they are for sides and visibility, not for shape
+MOST_VIEWS = 64  # enough views to decide sides and visibility
 
 
 def spread(cameras: Sequence[Camera]) -> Sequence[Camera]:
-    """Return at most ``MOST_VIEWS`` of the cameras, evenly spread over their order."""
+    """Return at most ``MOST_VIEWS`` of the cameras, evenly spread in their order."""
     return cameras[:: max(1, -(-len(cameras) // MOST_VIEWS))]
 
 
@@ -30,10 +30,10 @@ def seen_from(
     settings: RasterSettings,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights of N Gaussians in the views, [N] float64, and their normals towards these, [N, 3] float64.
+    """Return the weights [N] float64 of N Gaussians in the views, and their normals [N, 3] float64.
 
-    A weight is the sum of w_i over the pixels of the views that ``spread`` chooses. A normal
-    is a world unit vector, on the side from which most of that weight is seen. progress: receives (done, total) views.
+    A weight is the sum of w_i over the pixels of the views that ``spread`` chooses. A normal is a unit vector in the
+    world, on the side from which most of that weight is seen. progress: receives (done, total) views.
     """
     inputs = geometry_inputs(surfels)
     settings = replace(settings, geometry=False, distortion=False)

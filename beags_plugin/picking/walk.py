@@ -1,7 +1,7 @@
-"""How surely a random walk over the surface from each Gaussian meets the object first, and where that ends.
+"""The probability that a random walk over the surface from a Gaussian meets the object first, and the object's border.
 
-Grady, "Random Walks for Image Segmentation", PAMI 2006, with a leak: a walker ends in each step with a small
-probability, as one who has lost the object. Without a mark near a border this pulls it to where few walkers pass.
+After Grady, "Random Walks for Image Segmentation", PAMI 2006, with a leak: in each step a walker stops with a small
+probability. Where no mark is near, this moves the border to where few walkers pass.
 """
 
 from __future__ import annotations
@@ -11,20 +11,24 @@ import numpy as np
 from beags_plugin.picking.dots import dots
 from beags_plugin.picking.graph import FLOOR, SHORTEST, SurfaceGraph
 
-LEAK, MORE_LEAK = 2e-3, 5e-2  # beside a link's weight, at most 1; the second on planes of what is beside the object
-TOLERANCE = 1e-4  # of the residual's norm
+LEAK = 2e-3  # weight of stopping, beside links of at most 1
+MORE_LEAK = 5e-2  # added on the tangent planes of marks beside the object
+TOLERANCE = 1e-4  # norm of the residual, over that at the start
 MOST_ITERATIONS = 2_000
-LEAST_LEVEL, HIGHEST_LEVEL = 0.1, 0.98  # of a border
+LEAST_LEVEL, HIGHEST_LEVEL = 0.1, 0.98  # bounds of a border's level
 
 
 class Walker:
-    """The walks of one graph. Determinism: no product here is one that a library splits over threads."""
+    """The walks of one graph. Determinism: no library splits these products over threads."""
 
     def __init__(self, graph: SurfaceGraph) -> None:
         from scipy.sparse import csr_array
 
         count = len(graph.nodes)
-        first, second = graph.first.astype(np.int32), graph.second.astype(np.int32)  # a product is a third quicker
+        first, second = (
+            graph.first.astype(np.int32),
+            graph.second.astype(np.int32),
+        )  # a third faster than int64
         rows, columns = np.concatenate([first, second]), np.concatenate([second, first])
         values = np.concatenate([graph.weights, graph.weights])
         self._graph = graph
@@ -34,11 +38,11 @@ class Walker:
     def potential(
         self, inside: np.ndarray, outside: np.ndarray, excluded: np.ndarray, leaking: np.ndarray
     ) -> np.ndarray:
-        """Return p [M] float64, 0..1: 1 ``inside``, 0 ``outside`` or where no walk goes, elsewhere the walk's chance.
+        """Return the probability p [M] float64 that a walk from a node meets ``inside`` first.
 
-        inside, outside, excluded: disjoint [M] bool; no link leads to what is excluded. leaking: [M] bool, where a walk
-        ends more often, by ``MORE_LEAK``.
-        Solves (D + leak - W) p = 0 there by conjugate gradients, preconditioned by the diagonal.
+        p is 1 inside, and 0 outside or where no walk arrives. inside, outside, excluded: disjoint [M] bool; no link
+        leads to excluded nodes. leaking: [M] bool, nodes with ``MORE_LEAK``. Elsewhere (D + leak - W) p = 0 is solved
+        by conjugate gradients, preconditioned by the diagonal.
         """
         free = ~(inside | outside | excluded)
         degree = self._degree - self._links @ excluded.astype(np.float64) + MORE_LEAK * leaking
@@ -60,14 +64,12 @@ class Walker:
         return p.clip(0.0, 1.0)
 
     def border_level(self, p: np.ndarray, weights: np.ndarray, part: bool = False) -> float:
-        """Return the level t of which {p >= t} has the least border for its size, length / sqrt(area).
+        """Return the level t for which {p >= t} has the shortest border for its size, length / sqrt(area).
 
-        weights: [P] float64, of the graph's links, 0 to what is excluded. part: whether there must be a border, so that
-        it is no level that reaches all.
-
-        The length is a sum over cut links of their weight times what each stands for (``graph``).
-        The border of a piece of surface grows like the root of its area, so that this prefers no size. 0.5 if no p
-        lies between ``LEAST_LEVEL`` and ``HIGHEST_LEVEL``.
+        The length is the sum of weight times length over the cut links (``graph``). A border grows like the square root
+        of the area, so that the quotient favours no size. 0.5 if no p lies between ``LEAST_LEVEL`` and
+        ``HIGHEST_LEVEL``. weights: [P] float64, of the graph's links, 0 to excluded nodes. part: whether there must be
+        a border, so that {p >= t} is not everything.
         """
         count = len(p)
         order = np.argsort(-p, kind="stable")
@@ -79,10 +81,10 @@ class Walker:
         closed = np.bincount(np.maximum(*ends), lengths, count)
         border = np.cumsum(opened - closed)
         quotient = border / np.sqrt(np.cumsum(self._graph.areas[order]))
-        there = border > 0.5 * SHORTEST * FLOOR if part else np.ones(count, dtype=bool)  # the weakest link weighs more
+        there = border > 0.5 * SHORTEST * FLOOR if part else np.ones(count, dtype=bool)  # half the weakest link
         allowed = np.flatnonzero((p[order] >= LEAST_LEVEL) & (p[order] <= HIGHEST_LEVEL) & there)
         if len(allowed) == 0:
             return 0.5
         best = allowed[np.argmin(quotient[allowed])]
         following = p[order[best + 1]] if best + 1 < count else 0.0
-        return float(0.5 * (p[order[best]] + following))  # between the two, so that neither is indifferent
+        return float(0.5 * (p[order[best]] + following))  # halfway, so that no node lies exactly at the level

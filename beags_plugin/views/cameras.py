@@ -1,4 +1,4 @@
-"""Cameras of many views, in nerfstudio's terms: checked, resized with fixed pixel centres, made the method's own."""
+"""Cameras of many views in nerfstudio's terms: checks, resizing, and conversion to the method's cameras."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CAMERA_TYPES = {
 
 
 class AnyCameras(Protocol):
-    """Cameras with the fields of ``SceneCameras``: these, or nerfstudio's."""
+    """Cameras with the fields of ``SceneCameras``: its own or nerfstudio's."""
 
     camera_to_worlds: Any
     fx: Any
@@ -66,18 +66,11 @@ class SceneCameras:
         return SceneCameras(**{name: part[index] for name, part in parts.items()})
 
 
-def intrinsics(cameras: AnyCameras, index: int) -> Tensor:
-    """Return K [3, 3] float32 of one camera of a flat batch."""
-    K = torch.eye(3)
-    K[0, 0], K[1, 1] = cameras.fx[index, 0], cameras.fy[index, 0]
-    K[0, 2], K[1, 2] = cameras.cx[index, 0], cameras.cy[index, 0]
-    return K
-
-
 def camera_from_nerfstudio(cameras: AnyCameras, index: int = 0) -> Camera:
-    """Return the method's camera for one of many (any batch shape, ``index`` into the flattened batch).
+    """Return the method's camera for one of many, without lens distortion.
 
-    Float32, on the device of ``cameras``, differentiable in the pose; without lens distortion.
+    The cameras have any batch shape; ``index`` is into the flattened batch. Float32, on the device of ``cameras``,
+    differentiable in the pose.
     """
     pose = cameras.camera_to_worlds.reshape(-1, 3, 4)[index].float()
     fx, fy, cx, cy = (getattr(cameras, name).reshape(-1)[index].float() for name in ("fx", "fy", "cx", "cy"))
@@ -88,11 +81,11 @@ def camera_from_nerfstudio(cameras: AnyCameras, index: int = 0) -> Camera:
 
 
 def resize_cameras(cameras: AnyCameras, widths: Tensor, heights: Tensor) -> None:
-    """Set the cameras' sizes to ``widths`` x ``heights`` ([N, 1] integer pixels) in place and scale K to match.
+    """Set the cameras' sizes to ``widths`` x ``heights`` ([N, 1] integer pixels) in place, and scale K to match.
 
-    An image resized from W to W' pixels maps x to x W' / W in coordinates whose pixel centres are at + 0.5, so focal
-    length and principal point take exactly that factor, each axis its own. (nerfstudio's one factor shifts the image
-    by up to a pixel at its far edge.)
+    With pixel centres at + 0.5, resizing from W to W' pixels maps x to x W' / W, so each axis scales its focal length
+    and principal point by that factor. nerfstudio's single factor for both axes shifts the image by up to a pixel at
+    its far edge.
     """
     x_factor, y_factor = widths / cameras.width, heights / cameras.height
     cameras.fx, cameras.cx = cameras.fx * x_factor, cameras.cx * x_factor
@@ -100,8 +93,19 @@ def resize_cameras(cameras: AnyCameras, widths: Tensor, heights: Tensor) -> None
     cameras.width, cameras.height = widths.to(torch.int64), heights.to(torch.int64)
 
 
+def small_camera(camera: Camera, size: tuple[int, int]) -> Camera:
+    """Return a camera whose image of ``size`` (width, height) covers that of ``camera`` from edge to edge.
+
+    K is scaled as in ``resize_cameras``.
+    """
+    width, height = size
+    host = camera.host
+    factors = host.K.new_tensor([[width / host.width], [height / host.height], [1.0]])
+    return Camera(host.viewmat, host.K * factors, width, height).to(camera.viewmat.device)
+
+
 def take_intrinsics(cameras: AnyCameras, own: Camera) -> None:
-    """Give one camera of nerfstudio's, [1], the K and size of one of the method's, in place."""
+    """Set K and size of a camera of nerfstudio's, [1], in place to those of the method's camera ``own``."""
     K = own.host.K
     for name, value in {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}.items():
         setattr(cameras, name, torch.full_like(getattr(cameras, name), float(value)))
@@ -110,7 +114,7 @@ def take_intrinsics(cameras: AnyCameras, own: Camera) -> None:
 
 
 def downscaled_size(sizes: Tensor, factor: float) -> Tensor:
-    """Divide ``sizes``, pixels, by ``factor``: rounded, at least 1."""
+    """Return ``sizes``, pixels, divided by ``factor`` and rounded, at least 1."""
     return torch.floor(sizes / factor + 0.5).clamp(min=1).to(torch.int64)
 
 
@@ -141,6 +145,6 @@ def check_cameras(cameras: SceneCameras, images: Sequence[Path]) -> None:
         raise UserError(f"the lens distortion of {images[index]} is no number: correct the poses.")
     if (parameters[~fisheye, 3] != 0).any():
         raise UserError(f"the cameras have k4 != 0, which cannot be undone: undistort {images[0].parent} first.")
-    # nerfstudio takes all-zero parameters for "no distortion", which is wrong for an equidistant fisheye: it has to be
-    # undistorted too, so a coefficient too small to matter marks it.
+    # nerfstudio reads all-zero parameters as "no distortion", but an equidistant fisheye must be undistorted too. A
+    # coefficient too small to matter marks it.
     parameters[fisheye & (parameters == 0).all(1), 0] = 1e-12

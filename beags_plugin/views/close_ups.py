@@ -1,4 +1,4 @@
-"""Close-ups of training photos: regions around objects at up to the size of the files, each a view like any other."""
+"""Close-ups of training photos: regions around objects, at up to the size of the files, as further views."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera, cropped
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE, resize_nearest
 from beags_plugin.labels.label_maps import CompressedMap, to_int32
+from beags_plugin.views.cameras import small_camera
 from beags_plugin.views.photo_files import Box, PhotoFiles
-from beags_plugin.views.small_views import small_camera
 from beags_plugin.views.split_photos import resize_area
 from beags_plugin.views.views import View
 
 DETAIL = 4.0
-"""Pixels that are kept of all close-ups of a photo, in units of those that a step sees."""
+"""Pixels stored of all close-ups of a photo, over the pixels of a step."""
 MOST_BYTES = 1e9
-"""Of the close-ups of all photos; with more, fewer pixels are kept, but no fewer than a step sees."""
+"""Most bytes of all close-ups; fewer pixels are stored to stay below it, but never fewer than a step sees."""
 WINDOWS = 0.5
-"""Share of the steps that see a window of their close-up where it has more pixels than a step; others see it shrunk."""
+"""Share of the steps that see a window of a close-up larger than a step; the others see it scaled down."""
 
 
 @dataclass
 class CloseUp:
-    """A region of a training photo, at the size that is kept.
+    """A region of a training photo, at the size at which it is stored.
 
     photo: index of the view. camera: of the region. image: [h, w, 3] uint8. alpha: [h, w] uint8 or None. labels: of the
-    region, at its size or coarser.
+    region, at any size.
     """
 
     photo: int
@@ -45,7 +45,7 @@ class CloseUp:
     labels: CompressedMap
 
     def seen(self, size: tuple[int, int], window: Box) -> tuple[Camera, dict[str, Any]]:
-        """Return camera and batch of a window of the close-up, which is shrunk to ``size`` (width, height) before."""
+        """Return camera and batch of a window of the close-up, once that is scaled to ``size`` (width, height)."""
         left, top, right, bottom = window
         camera = cropped(small_camera(self.camera, size), left, top, right - left, bottom - top)
 
@@ -67,8 +67,8 @@ class CloseUp:
 class CloseUps:
     """The close-ups of all training photos, and which of them a step sees.
 
-    names: of the photos. pixels: of a step. share: of the steps that see a close-up, where their photo has one. seed:
-    with the step it decides what is seen.
+    names: of the photos. pixels: of a step. share: of the steps that see a close-up, if their photo has one. seed: it
+    decides together with the step which close-up is seen.
     """
 
     def __init__(
@@ -94,36 +94,36 @@ class CloseUps:
 
     @property
     def kept(self) -> float:
-        """Pixels that are kept of all close-ups of a photo."""
+        """Return the number of pixels stored of all close-ups of a photo."""
         return kept_pixels(self.pixels, len(self._photos))
 
     def drawn(self, photo: int, step: int) -> tuple[Camera, dict[str, Any]] | None:
-        """Return camera and batch, on the CPU, of the close-up that ``step`` sees of a photo; None: the whole photo."""
+        """Return camera and batch, on the CPU, of the close-up that a step sees; None if it sees the whole photo."""
         chance = random.Random(self.seed * 1_000_003 + step)
         own = self._of_photo.get(photo)
         if chance.random() >= self.share or not own:
             return None
         close_up = own[chance.randrange(len(own))]
-        kept = close_up.camera.width, close_up.camera.height
-        size = kept if chance.random() < WINDOWS else fitted(*kept, self.pixels)
+        stored = close_up.camera.width, close_up.camera.height
+        size = stored if chance.random() < WINDOWS else fitted(*stored, self.pixels)
         width, height = fitted(*size, self.pixels)
         left, top = chance.randint(0, size[0] - width), chance.randint(0, size[1] - height)
         return close_up.seen(size, (left, top, left + width, top + height))
 
     def views(self, device: torch.device | str) -> Iterator[View]:
-        """Yield each close-up as a view, shrunk to a step's pixels; its labels are those that training sees."""
+        """Yield each close-up as a view, scaled down to a step's pixels, with the labels that training sees."""
         for close_up, name in zip(self.close_ups, self.names, strict=True):
             size = fitted(close_up.camera.width, close_up.camera.height, self.pixels)
             camera = small_camera(close_up.camera, size).to(device)
             yield View(camera, name, partial(_data, close_up, size, device), partial(_labels, close_up, size, device))
 
     def replace_labels(self, labels: Sequence[Tensor]) -> None:
-        """Train on other labels, of the sizes of ``views``."""
+        """Replace the labels that training sees. labels: of the sizes of ``views``."""
         for close_up, each in zip(self.close_ups, labels, strict=True):
             close_up.labels = CompressedMap(each.cpu())
 
     def object_pixels(self) -> int:
-        """Return the number of the pixels of objects, at the size that is kept."""
+        """Return the number of pixels of objects, at the stored size."""
         total = 0.0
         for each in self.close_ups:
             labels = to_int32(each.labels.unpacked())
@@ -143,18 +143,18 @@ def _labels(close_up: CloseUp, size: tuple[int, int], device: torch.device | str
 
 
 def fitted(width: int, height: int, pixels: float) -> tuple[int, int]:
-    """Return a size of the same proportions with at most about ``pixels`` pixels; never a larger one."""
+    """Return the size of the same proportions with at most about ``pixels`` pixels, never larger than given."""
     factor = min(1.0, math.sqrt(pixels / (width * height)))
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
 def kept_pixels(pixels: int, photos: int) -> float:
-    """Return the number of pixels that are kept of all close-ups of one of ``photos``. pixels: of a step."""
+    """Return the number of pixels stored of all close-ups of one of ``photos`` photos. pixels: of a step."""
     return pixels * max(min(DETAIL, MOST_BYTES / (3.0 * pixels * photos)), 1.0)
 
 
 def kept_size(box: Box, boxes: int, kept: float) -> tuple[int, int]:
-    """Return width and height at which a close-up is kept, one of ``boxes`` of its photo. kept: ``kept_pixels``."""
+    """Return the stored width and height of a close-up, one of ``boxes`` of its photo. kept: ``kept_pixels``."""
     left, top, right, bottom = box
     return fitted(right - left, bottom - top, kept / boxes)
 
@@ -164,7 +164,7 @@ def read_close_ups(
 ) -> list[CloseUp]:
     """Read the close-ups of a photo, which is decoded once.
 
-    kept: ``kept_pixels``. whole: labels [H, W] of the whole photo at any size, where it has no mask.
+    kept: ``kept_pixels``. whole: labels [H, W] of the whole photo at any size if it has no mask, else None.
     """
     camera = files.full_camera(photo)
     masks = files.mask_regions(photo, boxes) if whole is None else None
@@ -172,12 +172,12 @@ def read_close_ups(
         assert whole is not None, "close-ups come from masks"
         sized = resize_nearest(whole, camera.height, camera.width)
         masks = [sized[top:bottom, left:right] for left, top, right, bottom in boxes]
-    found = []
+    close_ups = []
     for number, (box, region) in enumerate(zip(boxes, files.full_regions(photo, boxes), strict=True)):
         size = kept_size(box, len(boxes), kept)
         left, top, right, bottom = box
         own = small_camera(cropped(camera, left, top, right - left, bottom - top), size)
         alpha = resize_area(region["alpha"].numpy(), *size) if "alpha" in region else None
         labels = CompressedMap(torch.from_numpy(resize_nearest(masks[number], size[1], size[0]).astype(np.int32)))
-        found.append(CloseUp(photo, own, resize_area(region["image"].numpy(), *size), alpha, labels))
-    return found
+        close_ups.append(CloseUp(photo, own, resize_area(region["image"].numpy(), *size), alpha, labels))
+    return close_ups

@@ -1,6 +1,6 @@
 """COLMAP's models on disk, text and binary: cameras and images, in double precision.
 
-The counts that binary files promise are checked before memory of that size is taken.
+Counts in binary files are checked before memory of that size is allocated.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.stand_ins import stand_in
 from beags_plugin.system.reading.text import read_text, reason
 
-Found = TypeVar("Found")
+Content = TypeVar("Content")
 _IMAGE = struct.Struct("<i7di")  # id, rotation wxyz, translation, id of the camera; a name and its features follow
 _FEATURE = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _NAMED = re.compile(rf"^\d+(?:\s+\S+){{7}}\s+\d+\s+\S.*({'|'.join(map(re.escape, IMAGE_SUFFIXES))})$", re.IGNORECASE)
@@ -30,12 +30,12 @@ _PARAMETERS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
     "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
 }  # fmt: skip
-"""COLMAP's camera models in the order of their numbers, with how many parameters each has."""
+"""COLMAP's camera models in the order of their numbers, with their numbers of parameters."""
 
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """A camera of a model: the name of COLMAP's camera model, pixels, and that model's parameters [P] float64."""
+    """A camera of a model: COLMAP's name of its lens, its size in pixels, and the lens's parameters [P] float64."""
 
     model: str
     width: int
@@ -59,30 +59,29 @@ class ColmapImage:
 
 
 def model_files(folder: Path) -> tuple[Path, Path]:
-    """Return the files of cameras and images of a complete model, in nerfstudio's order of looking."""
+    """Return the files of cameras and images of a complete model; text takes precedence, as in nerfstudio."""
     end = "txt" if (folder / "cameras.txt").is_file() else "bin"
     return folder / f"cameras.{end}", folder / f"images.{end}"
 
 
 def read_cameras(file: Path) -> dict[int, ColmapCamera]:
-    """Read cameras.bin or cameras.txt, by id; raises ``UserError``."""
+    """Read cameras.bin or cameras.txt, by id; raise ``UserError``."""
     return read(_cameras_text if file.suffix == ".txt" else _cameras_binary, file)
 
 
 def read_images(file: Path) -> list[ColmapImage]:
-    """Read images.bin or images.txt in the order of ids; raises ``UserError``."""
-    found = read(_images_text if file.suffix == ".txt" else _images_binary, file)
-    return [found[index] for index in sorted(found)]
+    """Read images.bin or images.txt in the order of ids; raise ``UserError``."""
+    images = read(_images_text if file.suffix == ".txt" else _images_binary, file)
+    return [images[index] for index in sorted(images)]
 
 
-def read(reader: Callable[[Path], Found], file: Path) -> Found:
-    """Return what ``reader`` makes of a file of a model; any failure of it becomes a ``UserError``."""
+def read(reader: Callable[[Path], Content], file: Path) -> Content:
+    """Apply ``reader`` to a file of a model; any error becomes a ``UserError``."""
     try:
         return reader(file)
     except UserError:
         raise
-    # the readers let struct.error, IndexError and the like through
-    except Exception as error:
+    except Exception as error:  # such as struct.error and IndexError
         if (cause := stand_in(file)) is not None:
             raise UserError(f"{file} cannot be read: {cause}.") from error
         if isinstance(error, struct.error):
@@ -93,12 +92,12 @@ def read(reader: Callable[[Path], Found], file: Path) -> Found:
 
 
 def lines_of(file: Path) -> Iterator[str]:
-    """Yield the lines of a text file of a model without comments; line ends of any system are cut off."""
+    """Yield the lines of a text file of a model without comments, with the line ends of any system."""
     try:
         text = read_text(file)
     except UnicodeDecodeError:  # Windows writes names in its own code page
         text = _decoded(file.read_bytes())
-    lines = re.split(r"\r\n|\n|\r", text)  # not splitlines: names may hold what that takes for an end
+    lines = re.split(r"\r\n|\n|\r", text)  # splitlines would also split at characters in names
     return (line for line in lines if not line.lstrip().startswith("#"))
 
 
@@ -139,7 +138,7 @@ def _cameras_text(file: Path) -> dict[int, ColmapCamera]:
 
 
 def _images_text(file: Path) -> dict[int, ColmapImage]:
-    """Read images.txt: the name is the rest of its line, and the line of features may be empty or absent."""
+    """Read images.txt. The name is the rest of its line; the line of features may be empty or missing."""
     images, lines = {}, list(lines_of(file))
     at = 0
     while at < len(lines):
@@ -164,7 +163,7 @@ def _images_text(file: Path) -> dict[int, ColmapImage]:
 
 
 def _point_id(word: str) -> int:
-    """Return the id of a point, -1 for none, which some programs write without a sign."""
+    """Return the id of a point, -1 for none, which some programs write as an unsigned number."""
     return -1 if (point := int(word)) >= 1 << 63 else point
 
 
@@ -189,7 +188,7 @@ def _images_binary(file: Path) -> dict[int, ColmapImage]:
 
 
 def _decoded(name: bytes) -> str:
-    """Return a name; those of Windows may be in its own code page."""
+    """Decode a name from UTF-8, else from Windows' code page."""
     try:
         return name.decode("utf-8")
     except UnicodeDecodeError:

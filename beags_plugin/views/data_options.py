@@ -1,4 +1,4 @@
-"""Options of the data: how a scene's files are read and split, and what training sees of them."""
+"""Options of the data: how a scene's files are read and split, and which parts training sees."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class DataOptions:
     """Refuse data of which photos are missing, instead of going on without them."""
 
     def check(self) -> None:
-        """Raise ``UserError`` for a value that nothing can be made of."""
+        """Raise ``UserError`` for an unusable value."""
         if self.downscale_factor is not None and not 1.0 <= self.downscale_factor < math.inf:
             raise UserError(f"downscale_factor is {self.downscale_factor}: give 1 (full size) or more.")
         for name in ("scale_factor", "scene_scale"):
@@ -76,7 +76,7 @@ class DataOptions:
 
 
 def absolute(path: object) -> object:
-    """Return a given path as an absolute one; None and the empty path (not given) stay."""
+    """Return a path made absolute; None and the empty path, which means none, stay."""
     return Path(path).expanduser().absolute() if isinstance(path, (str, Path)) and Path(path) != Path() else path
 
 
@@ -92,7 +92,7 @@ class ViewOptions:
     dense_seeds: Literal["auto", "on", "off"] = "auto"
     """Whether a base begins with more seed points, on whose depth several photos agree; auto: where there are at most
     50 photos, of which features give few points. It takes one or two seconds a photo."""
-    begins: Suppress[bool] = False  # whether a base is to begin with seed points, which the pipeline says
+    begins: Suppress[bool] = False  # whether a base begins with seed points; the pipeline sets it
     focus: str = "off"
     """Share of the steps that see close-ups of objects, at up to the size of the photos' files, and not whole photos.
     off: none; auto: half, where masks cover less than 40 % of the photos' pixels and photos are scaled down."""

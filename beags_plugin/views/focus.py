@@ -1,4 +1,4 @@
-"""Focus: whether training sees close-ups of objects, and where these are in its photos."""
+"""Focus: whether training sees close-ups of objects, and where the objects are in its photos."""
 
 from __future__ import annotations
 
@@ -20,25 +20,27 @@ from beags_plugin.views.close_ups import CloseUps, kept_pixels, kept_size, read_
 from beags_plugin.views.photo_files import Box, PhotoFiles
 
 SHARE = 0.5
-"""Share of the steps that see a close-up where nobody gives one."""
+"""Default share of the steps that see a close-up."""
 MOST_COVERED = 0.4
 """Share of the photos' pixels from which on objects are large enough without close-ups."""
 PIXELS = 0.8
-"""Of a step with a close-up, in units of those of a whole photo: it shows more Gaussians a pixel, which take time."""
+"""Pixels of a step with a close-up, over those of a whole photo: a close-up has more Gaussians per pixel, which cost
+time."""
 LEAST_GAIN = 1.2
-"""Factor by which close-ups show objects larger than whole photos do, below which they are not worth their steps."""
+"""Magnification of objects by close-ups, below which they are not worth their steps."""
 MARGIN = 0.1  # space on each side of an object, over its longer side
-LEAST_PART = 0.05  # of an object's pixels; smaller parts of its mask are taken for errors
-CLOSE = 1.25  # Boxes become one where that has at most this many times their pixels.
-LEAST_SIDE = 32  # pixels of a close-up's side; SSIM's window has 11
+LEAST_PART = 0.05  # least share of an object's pixels in a part of its mask; smaller parts count as errors
+CLOSE = 1.25  # boxes are joined if the joint box has at most this many times their pixels
+LEAST_SIDE = 32  # least pixels of a close-up's side; SSIM's window has 11
 
 
 @dataclass(frozen=True)
 class Aim:
-    """Where the objects of a photo are. boxes: of its close-ups. covered: share of its pixels that show objects.
+    """Where the objects of a photo are.
 
-    gain: factor by which close-ups show objects larger than the whole photo at the size that is trained on. side: of
-    the square as large as the objects' boxes, pixels, in the whole photo.
+    boxes: of its close-ups. covered: share of its pixels that show objects. gain: magnification of objects in close-ups
+    over the whole photo at the size of the training. side: side of a square with the mean area of the objects' boxes,
+    pixels of the whole photo.
     """
 
     boxes: list[Box]
@@ -48,9 +50,9 @@ class Aim:
 
 
 def share_of(focus: str) -> float | None:
-    """Return the share of the steps that an option asks for; None for auto.
+    """Return the share of the steps that the option names; None for auto.
 
-    Raises ``UserError`` for what is neither auto, nor off, nor a share.
+    Raises ``UserError`` for other values than auto, off and a share.
     """
     if focus in ("auto", "off"):
         return None if focus == "auto" else 0.0
@@ -63,10 +65,10 @@ def share_of(focus: str) -> float | None:
 def focused(
     focus: str, files: PhotoFiles, labels: Callable[[int], Tensor | None], names: Sequence[str], seed: int
 ) -> CloseUps | None:
-    """Return the close-ups that training is to see; None where it sees whole photos alone.
+    """Return the close-ups that training sees; None if it sees whole photos alone.
 
-    labels: returns those of a photo [H, W] int32 at the size that is trained on, or None. names: of the photos. It says
-    in a line what the objects get, or with a share given why there are no close-ups.
+    labels: returns the labels of a photo [H, W] int32 at the size of the training, or None. names: of the photos. The
+    choice is printed in a line.
     """
     share = share_of(focus)
     if share == 0.0:
@@ -75,23 +77,23 @@ def focused(
     pixels = max(round(PIXELS * float((cameras.width * cameras.height).double().mean())), 1)
     kept = kept_pixels(pixels, len(cameras))
     aims = {
-        photo: _aim(files, photo, found.cpu().numpy(), kept)
+        photo: _aim(files, photo, mask.cpu().numpy(), kept)
         for photo in range(len(cameras))
-        if (found := labels(photo)) is not None
+        if (mask := labels(photo)) is not None
     }
-    shown = [aim for aim in aims.values() if aim.boxes]
+    with_objects = [aim for aim in aims.values() if aim.boxes]
     covered = float(np.mean([aim.covered for aim in aims.values()])) if aims else 0.0
-    if not shown:
+    if not with_objects:
         if share is not None:
             say("No mask of a training photo shows an object: focus is off.")
         return None
-    gain = float(np.mean([aim.gain for aim in shown]))
+    gain = float(np.mean([aim.gain for aim in with_objects]))
     if share is None and (covered >= MOST_COVERED or gain < LEAST_GAIN):
         if covered >= MOST_COVERED and gain >= LEAST_GAIN:
             say(f"Objects cover {covered:.0%} of the photos' pixels: training sees whole photos alone (focus is off).")
         return None
     share = SHARE if share is None else share
-    side = float(np.mean([aim.side for aim in shown]))
+    side = float(np.mean([aim.side for aim in with_objects]))
     say(
         f"Objects cover {covered:.1%} of the photos' pixels: {share:.0%} of the steps see close-ups of them, in which "
         f"they are about {side * gain:.0f} pixels large, not {side:.0f}."
@@ -104,7 +106,7 @@ def focused(
 
 
 def aim_by(close_ups: CloseUps, files: PhotoFiles, labels: Sequence[Tensor]) -> None:
-    """Add close-ups of photos that have none, where their labels [H, W] int show objects, as after reprojection."""
+    """Add close-ups of photos without any, if their labels [H, W] int show objects, as after reprojection."""
     for photo in close_ups.blind():
         whole = labels[photo].cpu().numpy().astype(np.int32)
         if boxes := _aim(files, photo, whole, close_ups.kept).boxes:
@@ -127,7 +129,7 @@ def _aim(files: PhotoFiles, photo: int, labels: np.ndarray, kept: float) -> Aim:
 
 
 def _boxes(labels: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the box of each object of labels [H, W], but for small parts of its mask that lie apart."""
+    """Yield the box of each object of labels [H, W], without small separate parts of its mask."""
     for class_id in np.unique(labels):
         if class_id in (BACKGROUND, IGNORE):
             continue
@@ -149,7 +151,7 @@ def _area(box: Sequence[float] | np.ndarray) -> float:
 
 
 def _joined(boxes: list[np.ndarray]) -> list[np.ndarray]:
-    """Return the boxes with those that stand close to each other joined into one."""
+    """Return the boxes, with those close to each other joined."""
     for one, other in combinations(range(len(boxes)), 2):
         whole = np.concatenate([np.minimum(boxes[one], boxes[other])[:2], np.maximum(boxes[one], boxes[other])[2:]])
         if _area(whole) <= CLOSE * (_area(boxes[one]) + _area(boxes[other])):
@@ -159,7 +161,7 @@ def _joined(boxes: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _full_box(box: np.ndarray, scale: np.ndarray, width: int, height: int) -> Box:
-    """Return a box in pixels of the file, within it and no smaller than ``LEAST_SIDE`` where the file is not."""
+    """Return a box in pixels of the file, inside it, with sides of at least ``LEAST_SIDE`` if the file is as large."""
     sides = []
     for low, high, size in zip((box * scale)[:2], (box * scale)[2:], (width, height), strict=True):
         first, last = max(round(low), 0), min(round(high), size)

@@ -1,4 +1,4 @@
-"""The held-out views of a run's data, as evaluation takes them."""
+"""The held-out views of a run's data, for evaluation."""
 
 from __future__ import annotations
 
@@ -25,19 +25,16 @@ _NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={}, removed={
 
 
 class HeldOutViews(Sequence[EvalView]):
-    """The test views of the data; masks are read when a view is asked for, at the size of their files.
+    """The test views of the data; the masks of a view are read when it is indexed, at the size of their files.
 
-    Masks of all visible objects come from ``ground_truth/masks``, else from the data's own, unless a program made these
-    of all views (``labels.classes.NO_TRUTH``); those of single objects
-    from ``ground_truth/visible``, silhouettes from ``ground_truth/silhouettes``, and what training photos show of them
-    from ``ground_truth/seen``, or from where the layout has them; pictures without an object from
-    ``ground_truth/removed``, and where these can be known from ``ground_truth/removed_shown``. All are undistorted like
-    the photographs. Indexing raises ``UserError`` for a file that cannot be read or has other proportions than its
-    photograph.
+    Masks of all visible objects come from ``ground_truth/masks``, else from the data's own masks, unless a program drew
+    these (``labels.classes.NO_TRUTH``). Files of single objects come from the folders of ``data.ground_truth``, or from
+    the layout. All are undistorted like the photos. Indexing raises ``UserError`` for a file that cannot be read, or
+    whose proportions differ from its photo's.
     """
 
     def __init__(self, manager: BothSplits, classes: Mapping[int, str], background: Tensor) -> None:
-        """Open the views. classes: id to name. background: [3], behind photographs with alpha, as in training."""
+        """Open the views. classes: id to name. background: [3], colour behind photos with alpha, as in training."""
         self.manager = manager
         self.classes = classes
         self.background = background.cpu()
@@ -58,16 +55,16 @@ class HeldOutViews(Sequence[EvalView]):
 
     @property
     def no_truth(self) -> Path | None:
-        """Return the file that says that a program drew the data's own masks; None where they count as truth."""
+        """Return the file that says that a program drew the data's masks; None if they count as ground truth."""
         return self._metadata["no_truth"]
 
     @property
     def stray_truth(self) -> str | None:
-        """Return a sentence about exact masks that belong to no view of the data; None without any."""
+        """Return a sentence on exact masks that belong to no view of the data; None without any."""
         return self._metadata["stray_truth"]
 
     def trained_on(self) -> int:
-        """Return the number of these views that are training views too."""
+        """Return how many of these views are also training views."""
         trained = set(self.manager.train_dataset.image_filenames)
         return sum(path in trained for path in self.manager.eval_dataset.image_filenames)
 
@@ -80,9 +77,9 @@ class HeldOutViews(Sequence[EvalView]):
         view = self._views[index]
         truth = self._metadata["ground_truth"] or _NO_TRUTH
         exact = truth["masks"][index] if truth["masks"] else None
-        # Where objects were labelled one by one, a view without such masks has no truth: its own mask is no substitute.
-        given = self.no_truth is None and not truth["visible"]
-        own = self._metadata["mask_filenames"][index] if given else None
+        # If objects were labelled one by one, a view without such masks has no ground truth, whatever its own mask.
+        trusted = self.no_truth is None and not truth["visible"]
+        own = self._metadata["mask_filenames"][index] if trusted else None
         file, kind = (exact, "ids") if exact else (own, self._kind)
         visible = None
         if file is not None:
@@ -108,7 +105,7 @@ class HeldOutViews(Sequence[EvalView]):
         )
 
     def _full(self, index: int, camera: Camera) -> FullPhoto | None:
-        """Return the photograph of a view at the size of its file; None where it is trained on at that size."""
+        """Return the photo of a view at the size of its file; None if training uses that size."""
         files = self.manager.files["eval"]
         full = files.full_camera(index)
         if (full.width, full.height) == (camera.width, camera.height):
@@ -116,10 +113,10 @@ class HeldOutViews(Sequence[EvalView]):
 
         def region(box: Box) -> tuple[Camera, Tensor]:
             left, top, right, bottom = box
-            found = files.full_regions(index, [box])[0]
-            photo = found["image"].float() / 255.0
-            if "alpha" in found:
-                photo = photo + (1.0 - found["alpha"].float() / 255.0)[..., None] * self.background
+            pixels = files.full_regions(index, [box])[0]
+            photo = pixels["image"].float() / 255.0
+            if "alpha" in pixels:
+                photo = photo + (1.0 - pixels["alpha"].float() / 255.0)[..., None] * self.background
             return cropped(full, left, top, right - left, bottom - top), photo
 
         return FullPhoto(full, region)
@@ -127,32 +124,32 @@ class HeldOutViews(Sequence[EvalView]):
     def _per_object(
         self, files: Mapping[str, Sequence[Path | None]], view: int
     ) -> tuple[dict[int, Tensor], dict[int, Tensor]]:
-        """Read the [h, w] bool masks of a view by object id, and what of them cannot be told, if anything."""
+        """Read the [h, w] bool masks of a view by object id, and their unknown pixels if there are any."""
         masks, unknown = {}, {}
         for class_id, file in self._files(files, view).items():
             ids = self._straight(file, read_object_mask(file, truth=True), view)
             masks[class_id] = torch.from_numpy(ids == 1)
-            if (untold := ids == IGNORE).any():  # Pixels outside the lens cannot be told either.
-                unknown[class_id] = torch.from_numpy(untold)
+            if (unlabelled := ids == IGNORE).any():  # also pixels outside the lens
+                unknown[class_id] = torch.from_numpy(unlabelled)
         return masks, unknown
 
     def _files(self, files: Mapping[str, Sequence[Path | None]], view: int) -> dict[int, Path]:
-        """Return object id to its file of a view, for those that have one."""
-        found = {c: files[name][view] for c, name in self.classes.items() if name in files}
-        return {c: file for c, file in found.items() if file is not None}
+        """Return the file of each object in a view, by id, for those that have one."""
+        own = {c: files[name][view] for c, name in self.classes.items() if name in files}
+        return {c: file for c, file in own.items() if file is not None}
 
     def _picture(self, file: Path, view: int) -> Tensor:
-        """Read a picture [H, W, 3] without an object, as the photograph is read."""
+        """Read a picture [H, W, 3] without an object in the way of the photo."""
         self._check_proportions("picture", file, image_size(file), view)
         return self.manager.files["eval"].picture(file, view)
 
     def _straight(self, file: Path, ids: np.ndarray, view: int) -> np.ndarray:
-        """Undistort ids; raises ``UserError`` if they have other proportions than the photograph."""
+        """Undistort ids; raise ``UserError`` if their proportions differ from the photo's."""
         self._check_proportions("mask", file, (ids.shape[1], ids.shape[0]), view)
         return self.manager.files["eval"].undistorted(ids, view)
 
     def _check_proportions(self, what: str, file: Path, size: tuple[int, int], view: int) -> None:
-        """Raise ``UserError`` if a file of width and height ``size`` has other proportions than the photograph."""
+        """Raise ``UserError`` if the proportions of ``size`` (width, height) differ from the photo's."""
         (width, height), (own_width, own_height) = image_size(self.manager.eval_dataset.image_filenames[view]), size
         if not same_proportions((width, height), size):
             raise UserError(

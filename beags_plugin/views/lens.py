@@ -1,4 +1,4 @@
-"""Lens distortion: removed from images of any size as nerfstudio does, put back, and applied to points."""
+"""Lens distortion: removed from images of any size as nerfstudio does, restored, and applied to points."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.views.cameras import FISHEYE, camera_from_nerfstudio, intrinsics
+from beags_plugin.views.cameras import FISHEYE, camera_from_nerfstudio
 
 if TYPE_CHECKING:
     from beags_plugin.views.cameras import AnyCameras
 
-_MARGIN = 0.5  # of the image on each side: farther out, a lens model may fold back into the image
+_MARGIN = 0.5  # space beyond each side, in images; farther out, a lens model may fold back into the image
 
 
 def has_lens(cameras: AnyCameras, index: int) -> bool:
@@ -22,7 +22,7 @@ def has_lens(cameras: AnyCameras, index: int) -> bool:
 
 
 def undistort_image(image: np.ndarray, distorted: AnyCameras, index: int) -> np.ndarray:
-    """Remove the lens distortion from an image [H, W, C] and crop it, as nerfstudio does; for a view with a lens."""
+    """Remove the lens distortion of a view from its image [H, W, C] and crop it, as nerfstudio does."""
     K, lens, new_K, (x, y, width, height) = _straightened(distorted, index, (image.shape[1], image.shape[0]))
     if int(distorted.camera_type[index]) == FISHEYE:
         maps = cv2.fisheye.initUndistortRectifyMap(
@@ -33,13 +33,12 @@ def undistort_image(image: np.ndarray, distorted: AnyCameras, index: int) -> np.
 
 
 def straighten(cameras: AnyCameras) -> None:
-    """Give cameras the K and size that their images have once undistorted, in place; no image is read for it."""
+    """Set K and size of cameras in place to those of their undistorted images; no image is read."""
     known: dict[tuple, tuple] = {}  # most scenes have one camera for all views
     for index in range(len(cameras)):
         if not has_lens(cameras, index):
             continue
         parts = (cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height, cameras.camera_type)
-        assert cameras.distortion_params is not None
         key = (*(float(part[index]) for part in parts), *cameras.distortion_params[index].tolist())
         if key not in known:
             size = int(cameras.width[index]), int(cameras.height[index])
@@ -53,7 +52,7 @@ def straighten(cameras: AnyCameras) -> None:
 
 
 def undistort_labels(labels: np.ndarray, distorted: AnyCameras, straight: AnyCameras, index: int) -> np.ndarray:
-    """Remove the lens distortion from labels; the nearest id is taken, as ids never blend.
+    """Remove the lens distortion from labels; each pixel takes the nearest id.
 
     labels: [h, w], the whole distorted image at any size. distorted, straight: the cameras before and after
     ``straighten``. Returns [h', w'], the whole straight image at the same scale; IGNORE outside the lens.
@@ -69,7 +68,7 @@ def undistort_alpha(alpha: np.ndarray, distorted: AnyCameras, straight: AnyCamer
 
 
 def straight_size(distorted: AnyCameras, straight: AnyCameras, index: int, shape: tuple[int, ...]) -> tuple[int, int]:
-    """Return width and height of the straight image at the scale at which the distorted one is of ``shape`` [h, w]."""
+    """Return width and height of the straight image at the scale where the distorted one has ``shape`` (h, w)."""
     height, width = shape
     return (
         max(1, round(int(straight.width[index]) * width / int(distorted.width[index]))),
@@ -81,10 +80,10 @@ def undistort_region(
     image: np.ndarray, distorted: AnyCameras, straight: AnyCameras, index: int, box: tuple[int, int, int, int],
     interpolation: int, border: int,
 ) -> np.ndarray:  # fmt: skip
-    """Return a region of a straight image, of which memory does not grow with the rest.
+    """Return a region of a straight image; memory grows with the region only.
 
     image: [h, w] or [h, w, C], the whole distorted image at any size. box: left, top, right and bottom in the straight
-    image at the same scale. border: what is outside the lens.
+    image at the same scale. border: value outside the lens.
     """
     left, top, right, bottom = box
     if not has_lens(distorted, index):
@@ -102,10 +101,10 @@ def redistort_labels(
     shape: tuple[int, int],
     border: int,
 ) -> np.ndarray:
-    """Put the lens distortion back into labels: the inverse of ``undistort_labels``.
+    """Restore the lens distortion of labels: the inverse of ``undistort_labels``.
 
-    labels: [h', w'], the whole straight image. shape: (h, w) of the distorted image at the same scale. Returns [h, w],
-    the nearest id of each pixel; ``border`` where the straight image does not reach.
+    labels: [h', w'], the whole straight image. shape: (h, w) of the distorted image at the same scale. border: value
+    outside the straight image. Returns [h, w].
     """
     if not has_lens(distorted, index):
         return labels
@@ -113,15 +112,15 @@ def redistort_labels(
     K = _intrinsics(distorted, index, width, height)
     new_K = _intrinsics(straight, index, labels.shape[1], labels.shape[0])
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    found = _straight(np.stack([columns, rows], axis=2).reshape(-1, 2), distorted, index, K, new_K)
-    maps = found.reshape(height, width, 2).astype(np.float32)
+    pixels = _straight(np.stack([columns, rows], axis=2).reshape(-1, 2), distorted, index, K, new_K)
+    maps = pixels.reshape(height, width, 2).astype(np.float32)
     return _nearest(labels, maps[..., 0], maps[..., 1], border)
 
 
 def project_through_lens(points: np.ndarray, cameras: AnyCameras, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Return pixels [P, 2] (centres at + 0.5) and depths [P] of world points [P, 3] float64 in a distorted view.
 
-    cameras: before ``straighten``. A point that is not near the image has the depth 0.
+    cameras: before ``straighten``. A point far outside the image has the depth 0.
     """
     camera = camera_from_nerfstudio(cameras, index)
     rotation, translation = (part.double().numpy() for part in (camera.rotation, camera.translation))
@@ -134,41 +133,41 @@ def project_through_lens(points: np.ndarray, cameras: AnyCameras, index: int) ->
     if not has_lens(cameras, index):
         return xy, z
     z[(z <= 0) | outside] = 0.0
-    kept = np.flatnonzero(z > 0)
-    if len(kept):
+    near = np.flatnonzero(z > 0)
+    if len(near):
         fisheye, lens = _opencv_lens(cameras, index)
         project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
-        xy[kept] = project(np.ascontiguousarray(local[kept, None]), np.zeros(3), np.zeros(3), K, lens)[0][:, 0]
+        xy[near] = project(np.ascontiguousarray(local[near, None]), np.zeros(3), np.zeros(3), K, lens)[0][:, 0]
     return xy, z
 
 
 def _straightened(
     distorted: AnyCameras, index: int, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, int, int, int]]:
-    """Return how nerfstudio's ``_undistort_image`` removes the lens of an image of width and height ``size``.
+    """Return how nerfstudio's ``_undistort_image`` removes the lens from an image of width and height ``size``.
 
-    That is, for OpenCV, whose pixel centres are whole numbers: K [3, 3], the lens's coefficients, the new K [3, 3],
-    and left, top, width and height of what it keeps of the new image. All in its own precision, so that bits agree.
+    Returns K [3, 3], the lens's coefficients, the new K [3, 3], and left, top, width and height of the crop of the new
+    image, for OpenCV, whose pixel centres are whole numbers. All have nerfstudio's precision, so that bits agree.
     """
-    assert distorted.distortion_params is not None
     k1, k2, k3, k4, p1, p2 = distorted.distortion_params[index].numpy()
-    K = intrinsics(distorted, index).numpy()
+    K = camera_from_nerfstudio(distorted, index).K.numpy()
     K[0, 2], K[1, 2] = K[0, 2] - 0.5, K[1, 2] - 0.5
     if int(distorted.camera_type[index]) == FISHEYE:
         lens = np.array([k1, k2, k3, k4])
         new_K = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, lens, size, np.eye(3), balance=0)
         return K, lens, new_K, (0, 0, *size)
     lens = np.array([k1, k2, p1, p2, k3, k4, 0, 0])
-    new_K, kept = cv2.getOptimalNewCameraMatrix(K, lens, size, 0)
-    x, y, width, height = kept
+    new_K, (x, y, width, height) = cv2.getOptimalNewCameraMatrix(K, lens, size, 0)
     return K, lens, new_K, (x, y, width, height)
 
 
 def _lens_maps(
     distorted: AnyCameras, straight: AnyCameras, index: int, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return x and y [h', w'] float32 of each straight pixel in the distorted image of ``shape`` [h, w]; None
-    without distortion."""
+    """Return x and y [h', w'] float32 of the straight pixels in the distorted image of ``shape``, or None.
+
+    None without distortion. shape: (h, w).
+    """
     if not has_lens(distorted, index):
         return None
     new_size = straight_size(distorted, straight, index, shape)
@@ -194,8 +193,7 @@ def _maps_of_region(
 
 
 def _opencv_lens(cameras: AnyCameras, index: int) -> tuple[bool, np.ndarray]:
-    """Return whether a view has a fisheye lens, and its coefficients float64 in OpenCV's order."""
-    assert cameras.distortion_params is not None
+    """Return whether a view has a fisheye lens, and its coefficients in OpenCV's order, float64."""
     k1, k2, k3, k4, p1, p2 = cameras.distortion_params[index].double().numpy()
     fisheye = int(cameras.camera_type[index]) == FISHEYE
     return fisheye, np.array([k1, k2, k3, k4] if fisheye else [k1, k2, p1, p2, k3])
@@ -203,7 +201,7 @@ def _opencv_lens(cameras: AnyCameras, index: int) -> tuple[bool, np.ndarray]:
 
 def _intrinsics(cameras: AnyCameras, index: int, width: int, height: int) -> np.ndarray:
     """Return K [3, 3] float64 of the view's image at this size, for OpenCV, whose pixel centres are whole numbers."""
-    K = intrinsics(cameras, index).double().numpy()
+    K = camera_from_nerfstudio(cameras, index).K.double().numpy()
     K = np.diag([width / int(cameras.width[index]), height / int(cameras.height[index]), 1.0]) @ K
     K[:2, 2] -= 0.5
     return K
@@ -214,7 +212,7 @@ def _nearest(labels: np.ndarray, x: np.ndarray, y: np.ndarray, border: int) -> n
 
 
 def straight_points(points: np.ndarray, distorted: AnyCameras, straight: AnyCameras, index: int) -> np.ndarray:
-    """Return where pixels [P, 2] (centres at + 0.5) of a distorted view are in the straight one, [P, 2] float64."""
+    """Return the places of a distorted view's pixels [P, 2] (centres at + 0.5) in the straight one, [P, 2] float64."""
     if not has_lens(distorted, index) or len(points) == 0:
         return points
     sizes = [(int(cameras.width[index]), int(cameras.height[index])) for cameras in (distorted, straight)]
@@ -223,7 +221,7 @@ def straight_points(points: np.ndarray, distorted: AnyCameras, straight: AnyCame
 
 
 def _straight(pixels: np.ndarray, distorted: AnyCameras, index: int, K: np.ndarray, new_K: np.ndarray) -> np.ndarray:
-    """Return where pixels [P, 2] (centres at whole numbers) of a view with a lens are in the straight one of new_K."""
+    """Return the places of pixels [P, 2] (centres at whole numbers) in the straight view with K ``new_K``."""
     fisheye, lens = _opencv_lens(distorted, index)
     pixels = np.ascontiguousarray(pixels.reshape(-1, 1, 2))
     if fisheye:

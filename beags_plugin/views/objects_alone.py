@@ -1,4 +1,4 @@
-"""Training on the objects' pixels alone, for turntables, where the objects move and the room stands."""
+"""Training on the objects' pixels alone, for turntables, where the objects turn and the room stays."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from beags_plugin.rasterizers.interface import RasterOutputs
 
 
 def objects_alone(batch: dict[str, Any]) -> dict[str, Any]:
-    """Make all of a batch's photo transparent but its objects, and say which pixels they are.
+    """Make a batch's photo transparent except for its objects.
 
-    Adds ``inside`` [H, W] bool, the pixels of any object, and ``known`` [H, W] bool, those that are not IGNORE.
+    Adds ``inside`` [H, W] bool, the pixels of any object, and ``known`` [H, W] bool, the pixels that are not IGNORE.
     """
     labels: Tensor = batch["labels"]
     known = labels != IGNORE
@@ -25,14 +25,15 @@ def objects_alone(batch: dict[str, Any]) -> dict[str, Any]:
 
 
 def where_known(color: Tensor, image: Tensor, batch: dict[str, Any]) -> Tensor:
-    """Return a rendering with the photo's own values where the batch knows nothing: no loss tells them apart."""
+    """Return a rendering with the photo's values at unlabelled pixels, where losses are then zero."""
     return torch.where(batch["known"][..., None], color, image) if "known" in batch else color
 
 
 def of_objects(render: RasterOutputs, image: Tensor, batch: dict[str, Any]) -> RasterOutputs:
-    """Return what losses see of a rendering: colour where it is known, depth in the pixels of objects alone.
+    """Return the part of a rendering that losses see: colour at known pixels, depth at pixels of objects.
 
-    All of it, unless the batch is one of ``objects_alone``. image: the photo [H, W, 3], its background filled in.
+    It is the whole rendering for a batch that is not of ``objects_alone``. image: the photo [H, W, 3], its background
+    filled in.
     """
     if "inside" not in batch:
         return render

@@ -1,6 +1,6 @@
-"""nerfstudio's normalisation of poses, step by step: bits of training depend on it.
+"""nerfstudio's normalisation of poses, step by step, as the bits of training depend on it.
 
-Its ``auto_orient_and_center_poses`` does the same; a test compares them.
+A test compares it with nerfstudio's ``auto_orient_and_center_poses``.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from torch import Tensor
 
 
 def oriented(poses: Tensor, method: str, center_method: str) -> tuple[Tensor, Tensor]:
-    """Turn and centre poses [V, 4, 4] float32; return them [V, 3, 4], and the transform [3, 4] that did it.
+    """Turn and centre poses [V, 4, 4] float32; return them [V, 3, 4], and the transform [3, 4] applied.
 
     method: pca, up, vertical or none. center_method: poses, focus or none. Raises ``ValueError`` for another.
     """
@@ -55,8 +55,9 @@ def _up(poses: Tensor, vertical: bool) -> Tensor:
     up = up / torch.linalg.norm(up)
     if not vertical:
         return up
-    # min ||X u|| for ||u|| = 1, X the cameras' x axes: the last right singular vector, unless the second smallest
-    # singular value says that the x axes lie on a line: then the mean up without its part along that line.
+    # The up direction minimises ||X u|| for ||u|| = 1, with X the cameras' x axes: it is the last right singular
+    # vector. If the second singular value says that the x axes lie on a line, it is the mean up without its part
+    # along that line.
     _, values, axes = torch.linalg.svd(poses[:, :3, 0], full_matrices=False)
     if values[1] > 0.17 * math.sqrt(poses.shape[0]):
         return axes[2, :] if torch.dot(axes[2, :], up) > 0 else -axes[2, :]
@@ -68,7 +69,7 @@ def _rotation_between(first: Tensor, second: Tensor) -> Tensor:
     """Return the rotation [3, 3] that turns one direction [3] to another, by Rodrigues' formula."""
     first, second = first / torch.linalg.norm(first), second / torch.linalg.norm(second)
     axis = torch.linalg.cross(first, second)
-    if torch.sum(torch.abs(axis)) < 1e-6:  # parallel: any axis across does
+    if torch.sum(torch.abs(axis)) < 1e-6:  # parallel: take any perpendicular axis
         other = torch.tensor([1.0, 0.0, 0.0]) if abs(first[0]) < 1e-6 else torch.tensor([0.0, 1.0, 0.0])
         axis = torch.linalg.cross(first, other)
     axis = axis / torch.linalg.norm(axis)

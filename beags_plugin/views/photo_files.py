@@ -1,4 +1,4 @@
-"""The files of one split's views, without lens distortion: at the size that is trained on, and at their own."""
+"""The files of one split's views, without lens distortion, at the size of the training and at their own."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from beags_plugin.data.files import image_size
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import to_compact
 from beags_plugin.views import lens
-from beags_plugin.views.cameras import camera_from_nerfstudio
-from beags_plugin.views.small_views import small_camera
+from beags_plugin.views.cameras import camera_from_nerfstudio, small_camera
 from beags_plugin.views.split_photos import SplitPhotos
 
 Box = tuple[int, int, int, int]
@@ -29,7 +28,7 @@ are excluded."""
 class PhotoFiles:
     """Photos and masks of the views of a dataset, whose cameras are straightened in place.
 
-    cameras: after that. Every picture that is returned shows what these cameras show.
+    cameras: the straightened ones, to which all returned pictures belong.
     """
 
     def __init__(self, dataset: SplitPhotos) -> None:
@@ -39,14 +38,14 @@ class PhotoFiles:
         self.cameras = dataset.cameras
 
     def load(self, index: int, image_type: Literal["uint8", "float32"]) -> dict[str, Any]:
-        """Read image, labels and alpha of a view from its files at the size that is trained on."""
+        """Read image, labels and alpha of a view from its files at the size of the training."""
         data = self.photo(index, image_type)
         labels = self.undistorted(self.dataset.get_labels(index, *self.dataset.file_sizes[index]), index)
         assert labels.shape == data["image"].shape[:2], "labels and image differ in size"
         return {"image_idx": index, **data, "labels": to_compact(torch.from_numpy(labels.astype(np.int32)))}
 
     def photo(self, index: int, image_type: Literal["uint8", "float32"]) -> dict[str, Any]:
-        """Read ``image`` and, if there is any, ``alpha`` of a view as ``load`` does."""
+        """Read ``image`` and, if there is any, ``alpha`` of a view, as ``load`` does."""
         image = self.dataset.get_numpy_image(index)
         if image_type == "float32":
             image = image.astype(np.float32) / np.float32(255.0)
@@ -69,9 +68,9 @@ class PhotoFiles:
         return lens.undistort_labels(labels, self._distorted, self.cameras, index)
 
     def straightened(self, places: np.ndarray, index: int) -> tuple[Camera, np.ndarray]:
-        """Return a view's camera without lens, and where places of its photo are in it, [P, 2] (centres at + 0.5).
+        """Return a view's camera without lens, and the pixels of places of its photo in it, [P, 2] float64.
 
-        places: [P, 2] float64, in shares of the photo's width and height.
+        places: [P, 2] float64, shares of the photo's width and height. Pixel centres are at + 0.5.
         """
         distorted = self._distorted
         points = places * [int(distorted.width[index]), int(distorted.height[index])]
@@ -79,16 +78,16 @@ class PhotoFiles:
         return camera_from_nerfstudio(self.cameras, index), straight
 
     def picture(self, file: Path, index: int) -> Tensor:
-        """Read another picture of a view as its photo [H, W, 3] float in 0..1."""
+        """Read another picture of a view in the way of its photo, [H, W, 3] float in 0..1."""
         image = self.dataset.get_numpy_image(index, file)
         if lens.has_lens(self._distorted, index):
             image = lens.undistort_image(image, self._distorted, index)
         return torch.from_numpy(image).float() / 255.0
 
     def as_in_file(self, labels: np.ndarray, index: int, border: int = IGNORE) -> np.ndarray:
-        """Put the lens distortion of a view's file back into labels [h', w'], at the size the file was read at.
+        """Restore the lens distortion of a view's file in labels [h', w'], at the size at which the file was read.
 
-        border: what is where the straight view does not reach.
+        border: value outside the straight view.
         """
         width, height = self.dataset.file_sizes[index]
         return lens.redistort_labels(labels, self._distorted, self.cameras, index, (height, width), border)
@@ -105,21 +104,21 @@ class PhotoFiles:
     def full_regions(self, index: int, boxes: Sequence[Box]) -> list[dict[str, Tensor]]:
         """Read regions of a view at the size of its file: ``image`` [h, w, 3] uint8 and, if there is any, ``alpha``.
 
-        The photo is decoded once and no copy of it is kept. boxes: within ``full_camera``.
+        The photo is decoded once and not stored. boxes: within ``full_camera``.
         """
         image, alpha = self.dataset.get_full_image(index)
         regions = []
         for box in boxes:
-            found = {"image": self._region(image, index, box, cv2.INTER_LINEAR)}
+            region = {"image": self._region(image, index, box, cv2.INTER_LINEAR)}
             if alpha is not None:
-                found["alpha"] = self._region(alpha, index, box, cv2.INTER_LINEAR)
-            regions.append({name: torch.from_numpy(values) for name, values in found.items()})
+                region["alpha"] = self._region(alpha, index, box, cv2.INTER_LINEAR)
+            regions.append({name: torch.from_numpy(values) for name, values in region.items()})
         return regions
 
     def mask_regions(self, index: int, boxes: Sequence[Box]) -> list[np.ndarray] | None:
-        """Read regions of a view's mask [h, w] uint16, of the same size as those of its photo; None without a mask.
+        """Read regions of a view's mask [h, w] uint16, at the size of those of its photo; None without a mask.
 
-        Where the mask's file is smaller than the photo's, the regions are as coarse as that file.
+        If the mask's file is smaller than the photo's, the regions are as coarse as that file.
         """
         if self.dataset.metadata["mask_filenames"][index] is None:
             return None

@@ -1,4 +1,4 @@
-"""The poses of all views as their source has them: transforms.json, a COLMAP model, or a layout's own table."""
+"""The poses of all views as in their source: transforms.json, a COLMAP model, or a layout's own table."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from beags_plugin.views.colmap_model import model_files, read_images, rotation_o
 
 SPLITS = ("train", "val", "test")
 OLD_APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
-"""What old versions of ns-process-data did to COLMAP's world without saying so in transforms.json."""
-_COLMAP_APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])  # nerfstudio takes -y for up
+"""The transform that old versions of ns-process-data applied to COLMAP's world without recording it."""
+_COLMAP_APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])  # nerfstudio has -y up
 
 
 @dataclass(frozen=True)
 class SourceViews:
     """All V views that a source names, sorted by name.
 
-    file: of the poses, for messages. names: with slashes. wanted: where the photos should lie. images: where they do,
-    None for missing ones. camera_to_world: [V, 3, 4] float64, OpenGL axes. cameras: None for missing photos.
-    members: split name to indices, or None. orientation, applied, applied_scale: of ``placing.place``. points: a .ply
-    in the poses' world, or None. missing: photos of further poses, which the layout has left out.
+    file: of the poses, for messages. names: with slashes. wanted: paths where the photos should be. images: their
+    files, None for missing ones. camera_to_world: [V, 3, 4] float64, OpenGL axes. cameras: None for missing photos.
+    members: split name to indices, or None. orientation, applied, applied_scale: see ``placing.place``. points: a .ply
+    in the poses' world, or None. missing: photos of further poses that the layout has left out.
     """
 
     file: Path
@@ -50,7 +50,7 @@ class SourceViews:
 
 
 def read_source(poses: ColmapModel | TransformsFile | PoseTable, root: Path) -> SourceViews:
-    """Read the views of a scene in ``root``; raises ``UserError`` for poses that cannot be read."""
+    """Read the views of a scene in ``root``; raise ``UserError`` for poses that cannot be read."""
     if isinstance(poses, PoseTable):
         return _of_table(poses)
     return _of_colmap(poses, root) if isinstance(poses, ColmapModel) else _of_transforms(poses, root)
@@ -71,7 +71,7 @@ def _of_transforms(poses: TransformsFile, root: Path) -> SourceViews:
         finder = PhotoFinder([poses.images], loose_folders=True)
         wanted = [poses.images / PurePosixPath(name).name for name in names]
         images = finder.find([PurePosixPath(name).name for name in names])
-        if not all(images):  # they may lie in folders of their own there
+        if not all(images):  # they may be in subfolders
             images = [image or other for image, other in zip(images, finder.find(names), strict=True)]
     if any("mask_path" in frame for frame in frames):
         say("mask_path of transforms.json is not used: beags-data reads class maps only.")
@@ -101,15 +101,15 @@ def _of_transforms(poses: TransformsFile, root: Path) -> SourceViews:
 def _of_colmap(poses: ColmapModel, root: Path) -> SourceViews:
     cameras_file, images_file = model_files(poses.folder)
     cameras = colmap_cameras(cameras_file)
-    found = sorted(read_images(images_file), key=lambda image: (poses.images / plain_name(image.name)).as_posix())
-    names = [plain_name(image.name) for image in found]
+    views = sorted(read_images(images_file), key=lambda image: (poses.images / plain_name(image.name)).as_posix())
+    names = [plain_name(image.name) for image in views]
     wanted = [poses.images / name for name in names]
     files = list_images(poses.images)
-    images = PhotoFinder([poses.images], loose_folders=True).find([image.name for image in found])
+    images = PhotoFinder([poses.images], loose_folders=True).find([image.name for image in views])
     if poses.in_order and len(files) == len(names) and not any(images):
         images = list(files)
-    matrices = np.zeros((len(found), 3, 4))
-    for matrix, image in zip(matrices, found, strict=True):
+    matrices = np.zeros((len(views), 3, 4))
+    for matrix, image in zip(matrices, views, strict=True):
         if image.camera not in cameras:
             raise UserError(
                 f"{images_file} gives {image.name} the camera {image.camera}, which {cameras_file} lacks: export the "
@@ -117,7 +117,7 @@ def _of_colmap(poses: ColmapModel, root: Path) -> SourceViews:
             )
         length = np.linalg.norm(image.quaternion)
         if not (length > 0 and np.isfinite(image.translation).all()):
-            raise UserError(f"{images_file} gives {image.name} no pose that is a number: export the model again.")
+            raise UserError(f"{images_file} gives {image.name} a pose that is no number: export the model again.")
         world_to_camera = np.eye(4)
         world_to_camera[:3] = np.c_[rotation_of(image.quaternion / length), image.translation]
         matrix[:] = np.linalg.inv(world_to_camera)[:3] * [1.0, -1.0, -1.0, 1.0]
@@ -128,7 +128,7 @@ def _of_colmap(poses: ColmapModel, root: Path) -> SourceViews:
         if (root / f"{split}_list.txt").is_file()
     }
     return SourceViews(
-        poses.folder, names, wanted, images, matrices, [cameras[image.camera] for image in found], members or None,
+        poses.folder, names, wanted, images, matrices, [cameras[image.camera] for image in views], members or None,
         applied=_COLMAP_APPLIED,
     )  # fmt: skip
 
@@ -157,20 +157,20 @@ def _listed(file: Path) -> list[str]:
 
 
 def _split(split: str, names: Sequence[str], members: Sequence[str], file: Path, folder: Path) -> list[int]:
-    """Return the indices of the views that a split names; raises ``UserError`` for one without a pose.
+    """Return the indices of the views that a split names; raise ``UserError`` for one without a pose.
 
-    names: of the views; members: of the split's photos; folder: which these are below, for messages.
+    names: of the views. members: names of the split's photos. folder: of these, for messages.
     """
     index_of = {name: index for index, name in enumerate(names)}
-    loosely = {without_suffix(name): index for name, index in index_of.items()}
-    found = set()
+    of_stem = {without_suffix(name): index for name, index in index_of.items()}
+    indices = set()
     for member in members:
         name = plain_name(member)
-        index = index_of.get(name, loosely.get(without_suffix(name)))
+        index = index_of.get(name, of_stem.get(without_suffix(name)))
         if index is None:
             raise UserError(
                 f"the split {split} names {folder / name}, of which {file} has no pose: correct the name, or delete "
                 "the split."
             )
-        found.add(index)
-    return sorted(found)
+        indices.add(index)
+    return sorted(indices)

@@ -15,7 +15,8 @@ from beags_plugin.data.frame_cameras import FrameCamera
 from beags_plugin.data.photo_files import missing_note, without_suffix
 from beags_plugin.system.errors import UserError
 from beags_plugin.views.cameras import CAMERA_TYPES, SceneCameras
-from beags_plugin.views.placing import Normalization, Placing, far_note, place
+from beags_plugin.views.data_options import DataOptions
+from beags_plugin.views.placing import Placing, far_note, place
 from beags_plugin.views.pose_sources import read_source
 
 
@@ -23,9 +24,10 @@ from beags_plugin.views.pose_sources import read_source
 class PosedViews:
     """All views of a scene, sorted by name, before they are split.
 
-    stems: of each view that of its file, that in the poses, and its path below the folder of all files. members: split
-    name to indices of its views; None where the poses name no splits. placing: how the world of the poses' file was
-    moved. points: a .ply of seed points in that world, which the poses name, or None. notes: sentences for the user.
+    stems: names of each view: the stem of its file, that in the poses, and its path below the folder of all files.
+    members: split name to indices of its views; None if the poses name no splits. placing: how the world of the poses'
+    file was moved. points: a .ply of seed points in that world that the poses name, or None. notes: sentences for the
+    user.
     """
 
     images: list[Path]
@@ -37,10 +39,11 @@ class PosedViews:
     notes: tuple[str, ...] = ()
 
 
-def read_poses(poses: Poses, root: Path, normalization: Normalization, strict: bool = False) -> PosedViews:
-    """Read the views of a scene in ``root``; raises ``UserError`` if they cannot be read or there are none.
+def read_poses(poses: Poses, root: Path, options: DataOptions) -> PosedViews:
+    """Read the views of a scene in ``root``; raise ``UserError`` if they cannot be read or there are too few.
 
-    Views whose photos are missing are left out with a note; with ``strict``, or if they are more than half, refused.
+    Views whose photos are missing are left out with a note; it is an error if they are more than half, or with
+    ``strict``.
     """
     source = read_source(poses, root)
     file = source.file
@@ -50,12 +53,12 @@ def read_poses(poses: Poses, root: Path, normalization: Normalization, strict: b
         raise UserError(f"{file} holds the pose of one image alone: give poses for at least two.")
     missing = [path for path, image in zip(source.wanted, source.images, strict=True) if image is None]
     missing += source.missing
-    notes = [missing_note(missing, len(source.names) + len(source.missing), file, strict)]
-    # The missing ones count here too, so that a run keeps its world when a photo goes.
+    notes = [missing_note(missing, len(source.names) + len(source.missing), file, options.strict)]
+    # Views without a photo count here too, so that a run keeps its world when a photo is removed.
     placed, placing = place(
-        source.camera_to_world, normalization, file, source.orientation, source.applied, source.applied_scale
+        source.camera_to_world, options, file, source.orientation, source.applied, source.applied_scale
     )
-    notes.append(far_note(placing, normalization.center_method == "none"))
+    notes.append(far_note(placing, options.center_method == "none"))
     there = [index for index, image in enumerate(source.images) if image is not None]
     images = [image.absolute() for image in source.images if image is not None]
     cameras = _cameras(file, [camera for index in there if (camera := source.cameras[index])], placed[there], images)

@@ -1,4 +1,4 @@
-"""How the data parser understood a scene, in sentences for the user."""
+"""Sentences for the user on how a scene's data were read."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from beags_plugin.views.poses import PosedViews
 
 
 def recognised(parser: Any, scene: Dataset, views: PosedViews, metadata: Mapping[str, Any]) -> list[str]:
-    """Describe in a line how the data was understood, and add notes for the user."""
+    """Return a line on how the data was read, and notes for the user."""
     stems = set().union(*views.stems)
     absent = [name for name in scene.split.held_out if name not in stems]
     notes = [
-        f"The protocol holds out {name}, which no image here is called: name that view with beags-data --held-out."
+        f"The protocol holds out {name}, but no image has that name: name the view with beags-data --held-out."
         for name in absent
     ]
     truth = metadata["ground_truth"] or {"visible": {}, "silhouettes": {}}
     if unknown := sorted({*truth["visible"], *truth["silhouettes"]} - set(metadata["classes"].values())):
         notes.append(
-            f"Exact masks of {', '.join(map(repr, unknown))} do not count, as no class is called so: "
+            f"Exact masks of {', '.join(map(repr, unknown))} do not count, as no class has that name: "
             f'name the classes in {scene.root / parser.config.classes_path}, {{"id": "name"}}.'
         )
     unposed = None if isinstance(scene.poses, PoseTable) else unposed_note(views.images)

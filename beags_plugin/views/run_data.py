@@ -1,4 +1,4 @@
-"""The data of a finished run: its views, each photo and mask read when it is first asked for."""
+"""The data of a finished run: its views, each of whose photos and masks is read when first used."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Split = Literal["train", "eval"]
 
 
 class BothSplits(Protocol):
-    """What holds the training and the held-out views of a scene: ``RunData``, or the data manager of a training."""
+    """The training and the held-out views of a scene: ``RunData``, or the data manager of a training."""
 
     @property
     def train_dataset(self) -> Any: ...
@@ -40,9 +40,9 @@ class BothSplits(Protocol):
 class RunData:
     """The training and held-out views of a run, as its data manager gave them, on the CPU.
 
-    held_out: the split that is "eval": val, or test. scene: of the options, if it has been opened before. Photos stay
-    in memory where all of a split take at most ``stream_above_gb`` of the options. Raises
-    ``UserError`` for data that cannot be read.
+    held_out: the split "eval", which is val or test. scene: of the options, if it is already open. Photos stay in
+    memory if all of a split take at most ``stream_above_gb`` of the options. Raises ``UserError`` for data that cannot
+    be read.
     """
 
     def __init__(

@@ -9,19 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from beags_plugin.data.dataset import Dataset, MaskKind
+from beags_plugin.data.dataset import Dataset, MaskKind, split_views
 from beags_plugin.data.files import check_mask_files, check_same_size, files_of_views, image_size
 from beags_plugin.data.ground_truth import find_ground_truth, of_views, stray_note
-from beags_plugin.data.labels import read_class_names
 from beags_plugin.data.layout import read_dataset
 from beags_plugin.data.orientation import sideways_photo_error
-from beags_plugin.data.split import split_views
-from beags_plugin.labels.classes import NO_TRUTH
+from beags_plugin.labels.classes import NO_TRUTH, read_class_names
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
 from beags_plugin.views.cameras import SceneCameras, check_cameras, downscaled_size, resize_cameras
 from beags_plugin.views.data_options import DataOptions
-from beags_plugin.views.placing import Normalization, Placing
+from beags_plugin.views.placing import Placing
 from beags_plugin.views.poses import PosedViews, read_poses
 from beags_plugin.views.recognised import images_root, recognised
 from beags_plugin.views.seed_points import starting_points
@@ -29,18 +27,18 @@ from beags_plugin.views.seed_points import starting_points
 if TYPE_CHECKING:
     from beags_plugin.views.tracks import Tracks
 
-LEAST_PIXELS = 2  # of a side that was scaled down; fewer show nothing
+LEAST_PIXELS = 2  # least pixels of a side after scaling down
 
 
 @dataclass(frozen=True)
 class SplitData:
     """The V views of one split.
 
-    metadata: per view where it is a list: ``points3D_xyz`` [P, 3] float32 in the world of the cameras, ``points3D_rgb``
-    [P, 3] uint8, ``points3D_random`` bool, ``classes`` dict id -> name, ``mask_filenames`` list of Path or None,
-    ``mask_kind`` (see ``data.dataset.MaskKind``), ``no_truth`` (the file that says so of the masks) or None,
-    ``ignore_ids``, ``ground_truth`` (see ``data.ground_truth.GroundTruth``) or None, ``stray_truth`` (a sentence about
-    exact masks of no view) or None.
+    metadata: ``points3D_xyz`` [P, 3] float32 in the world of the cameras, ``points3D_rgb`` [P, 3] uint8,
+    ``points3D_random`` (whether the points are sampled), ``classes`` (id to name), ``mask_filenames`` (a path or None
+    for each view), ``mask_kind`` (``data.dataset.MaskKind``), ``no_truth`` (the file ``labels.classes.NO_TRUTH``, or
+    None), ``ignore_ids``, ``ground_truth`` (``data.ground_truth.GroundTruth`` or None), ``stray_truth`` (a sentence on
+    exact masks of no view, or None).
     """
 
     images: list[Path]
@@ -50,9 +48,9 @@ class SplitData:
 
 
 class SceneData:
-    """A scene that options name, read when it is first asked for; every user error is a ``UserError``.
+    """The scene that some options name, read when first used; all its methods raise ``UserError``.
 
-    truth: whether to look for exact masks too, which evaluation alone needs.
+    truth: whether to look for exact masks too, which only evaluation needs.
     """
 
     def __init__(self, config: DataOptions, truth: bool = True) -> None:
@@ -66,24 +64,23 @@ class SceneData:
         config = self.config
         config.check()
         self._scene = scene = read_dataset(Path(config.data).absolute(), config.layout, config.images_path)
-        options = {name: getattr(config, name) for name in Normalization.__dataclass_fields__}
-        views = read_poses(scene.poses, scene.root, Normalization(**options), config.strict)
+        views = read_poses(scene.poses, scene.root, config)
         check_cameras(views.cameras, views.images)
         return scene, views
 
     def tracks(self, split: str) -> Tracks:
-        """Return which points each view of a split shows, and where: of the COLMAP model, else seed points.
+        """Return the points that each view of a split shows, and where: of the COLMAP model, else seed points.
 
-        Empty where nothing says so. The outputs of a split must have been asked for before.
+        Empty if no file tells. ``split`` must have been called before.
         """
-        from beags_plugin.views.tracks import features_of, seeds_seen  # they import OpenCV
+        from beags_plugin.views.tracks import features_of, seeds_seen  # this imports OpenCV
 
         views = self._views
         assert views is not None
-        found = features_of(self._scene, views)
-        if not found and not self._metadata["points3D_random"]:
-            found = seeds_seen(self._scene.root, self._metadata["points3D_xyz"].double().numpy(), views)
-        return [found[view] for view in self.views_of_split(views, split)] if found else []
+        tracks = features_of(self._scene, views)
+        if not tracks and not self._metadata["points3D_random"]:
+            tracks = seeds_seen(self._scene.root, self._metadata["points3D_xyz"].double().numpy(), views)
+        return [tracks[view] for view in self.views_of_split(views, split)] if tracks else []
 
     def mask_files(self, scene: Dataset, views: PosedViews) -> tuple[list[Path | None], Path, MaskKind]:
         """Return the mask file of each view or None, the folder of the masks, and their kind."""
@@ -115,7 +112,7 @@ class SceneData:
         self._views = views
 
     def _read_metadata(self, scene: Dataset, views: PosedViews) -> dict[str, Any]:
-        """Check the files against each other and return the metadata that all splits share."""
+        """Check the files against each other, and return the metadata that all splits share."""
         config = self.config
         sizes = [image_size(path) for path in views.images]
         self.fit_cameras(views, sizes)
@@ -142,7 +139,7 @@ class SceneData:
         }
 
     def check_folder(self, masks: Path) -> None:
-        """Raise ``UserError`` where the user has named a folder of masks that is not there."""
+        """Raise ``UserError`` if the user has named a folder of masks that does not exist."""
         if self.config.masks_path is not None and not masks.is_dir():
             raise UserError(
                 f"the folder of masks {masks} does not exist: correct masks_path; a relative one lies in the scene."
@@ -153,7 +150,7 @@ class SceneData:
         cameras = views.cameras
         camera_sizes = torch.cat([cameras.width, cameras.height], 1).tolist()
         for path, (width, height), (camera_width, camera_height) in zip(views.images, sizes, camera_sizes, strict=True):
-            # A smaller copy of the images rounds each side by up to a pixel; more is another picture.
+            # A smaller copy of an image rounds each side by up to a pixel; a larger difference means another image.
             expected = width * camera_height / camera_width
             if abs(expected - height) > 1.0 + expected / width:
                 if sentence := sideways_photo_error(path, (width, height), (camera_width, camera_height)):
@@ -177,7 +174,7 @@ class SceneData:
         if split not in ("train", "val", "test"):
             raise ValueError(f"unknown split {split!r}")
         if views.members is not None:
-            # nerfstudio asks for val while training and for test in ns-eval; data often names one of them
+            # nerfstudio uses val in training and test in ns-eval, but data often names only one of them.
             for name in {"train": ("train",), "val": ("val", "test"), "test": ("test", "val")}[split]:
                 if views.members.get(name):
                     return views.members[name]

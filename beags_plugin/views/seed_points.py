@@ -1,4 +1,4 @@
-"""Seed points of training: read from a file, or sampled where the cameras look."""
+"""Seed points of training, read from a file or sampled where the cameras look."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ from beags_plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.views.colmap_files import read_colmap_points
 from beags_plugin.views.poses import PosedViews
 
-SEED = 0  # of the sampled points
-_FAR, _TOO_FAR = 100.0, 1e4  # cameras' reach beyond which points count only if a photo shows them, or not at all
+SEED = 0  # seed of the sampling
+# Distance, over the cameras' extent, beyond which points count only if a photo shows them, and beyond which never.
+_FAR, _TOO_FAR = 100.0, 1e4
 
 
 def starting_points(scene: Dataset, views: PosedViews, count: int) -> dict[str, Any]:
-    """Return the seed points of a scene in the world of its cameras, or ``count`` sampled ones where it has none.
+    """Return the seed points of a scene in the world of its cameras, or ``count`` sampled ones if it has none.
 
-    Returns ``points3D_xyz`` [P, 3] float32, ``points3D_rgb`` [P, 3] uint8 and ``points3D_random``, whether they are
-    sampled: between the depths of the poses, if these have any. Points of a file are taken only if they lie between
-    those depths. Raises ``UserError`` for a file that cannot be read.
+    Returns ``points3D_xyz`` [P, 3] float32, ``points3D_rgb`` [P, 3] uint8, and ``points3D_random``, whether they are
+    sampled. If the poses give depths, points are sampled between them, and those of a file are used only if they lie
+    between them. Raises ``UserError`` for a file that cannot be read.
     """
     cameras = [camera_from_nerfstudio(views.cameras, index) for index in range(len(views.images))]
     bounds = scene.poses.bounds if isinstance(scene.poses, PoseTable) else None
@@ -47,7 +48,7 @@ def starting_points(scene: Dataset, views: PosedViews, count: int) -> dict[str, 
                 say(f"The seed points {file} are {torn}: export them in double precision, or in local coordinates.")
             return {"points3D_xyz": moved, "points3D_rgb": torch.from_numpy(colors), "points3D_random": False}
         if len(points):
-            say(f"{file} is not used: its points do not lie where the poses look.")
+            say(f"{file} is not used, because its points do not lie where the cameras look.")
     if bounds is None:
         xyz, rgb = random_points(cameras, count)
     else:
@@ -56,9 +57,9 @@ def starting_points(scene: Dataset, views: PosedViews, count: int) -> dict[str, 
 
 
 def _read(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read positions [N, 3] float64 and colours [N, 3] uint8 of a file, without points whose places are no numbers.
+    """Read positions [N, 3] float64 and colours [N, 3] uint8 of a file, without points that are no numbers.
 
-    Raises ``UserError`` for a file of another kind, or where no point is left of some.
+    Raises ``UserError`` for another kind of file, and if all its points are no numbers.
     """
     if file.suffix.lower() == ".ply":
         points, colors = read_ply_points(file)
@@ -66,7 +67,7 @@ def _read(file: Path) -> tuple[np.ndarray, np.ndarray]:
         points, colors = read_colmap_points(file)
     else:
         raise UserError(
-            f"the seed points {file} are of a format that is not read: save them as a .ply, and name that in "
+            f"the seed points {file} have a format that cannot be read: save them as a .ply, and name that in "
             "ply_file_path."
         )
     known = np.isfinite(points).all(axis=1)
@@ -79,11 +80,11 @@ def _read(file: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def random_points(cameras: Sequence[Camera], count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sample points uniformly in the ball around the cameras' point of interest (see ``_point_of_interest``).
+    """Sample points uniformly in a ball around ``_point_of_interest``.
 
-    Its radius is half the cameras' median distance from that point. Kept are points that at least half of the views
-    see (or as many as see the best tenth, where frusta overlap less).
-    Returns positions [count, 3] float32 and colours [count, 3] uint8, mid-grey.
+    Its radius is half the cameras' median distance from that point. Points are used if at least half of the views see
+    them, or, where frusta overlap less, as many as see the best tenth. Returns positions [count, 3] float32 and colours
+    [count, 3] uint8, mid-grey.
     """
     rotations, centers = _poses(cameras)
     focus = _point_of_interest(rotations, centers)
@@ -103,7 +104,7 @@ def random_points(cameras: Sequence[Camera], count: int) -> tuple[np.ndarray, np
 def points_between(cameras: Sequence[Camera], bounds: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample points within the cameras' depths, uniform in each image and in inverse depth.
 
-    bounds: [V, 2] nearest and farthest depth of each view. Points are kept, and returned, as in ``random_points``.
+    bounds: [V, 2] nearest and farthest depth of each view. Points are chosen and returned as in ``random_points``.
     """
     rotations, centers = _poses(cameras)
     to_rays = np.stack([np.linalg.inv(camera.K.double().numpy()) for camera in cameras])
@@ -129,30 +130,30 @@ def _poses(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _seen_by_many(sample: Callable[[], tuple[np.ndarray, np.ndarray]], count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``count`` of the points that ``sample`` returns with their share of views, those of large share."""
+    """Return ``count`` of the sampled points that many views see. sample: returns points and their shares of views."""
     points, share = sample()
     threshold = min(0.5, float(np.quantile(share, 0.9)))
-    kept = [points[share >= threshold]]
-    while sum(map(len, kept)) < count:
+    chosen = [points[share >= threshold]]
+    while sum(map(len, chosen)) < count:
         points, share = sample()
-        kept.append(points[share >= threshold])
-    xyz = np.concatenate(kept)[:count].astype(np.float32)
+        chosen.append(points[share >= threshold])
+    xyz = np.concatenate(chosen)[:count].astype(np.float32)
     return xyz, np.full((count, 3), 128, np.uint8)
 
 
 def _within_bounds(points: np.ndarray, cameras: Sequence[Camera], bounds: np.ndarray) -> float:
-    """Return the share of points [P, 3] inside some view's image and, to a tenth, its depths (bounds [V, 2])."""
-    found = np.zeros(len(points), bool)
+    """Return the share of points [P, 3] in some view's image and, within a tenth, its depths (bounds [V, 2])."""
+    within = np.zeros(len(points), bool)
     for camera, (near, far) in zip(cameras, bounds, strict=True):
         local = (points - camera.center.double().numpy()) @ camera.rotation.double().numpy().T
         x, y, w = camera.K.double().numpy() @ local.T
         inside = (x >= 0) & (x < camera.width * w) & (y >= 0) & (y < camera.height * w)
-        found |= inside & (w > 0.9 * near) & (w < 1.1 * far)
-    return float(found.mean()) if len(points) else 0.0
+        within |= inside & (w > 0.9 * near) & (w < 1.1 * far)
+    return float(within.mean()) if len(points) else 0.0
 
 
 def _seen_by_any(points: np.ndarray, cameras: Sequence[Camera]) -> bool:
-    """Return whether points [P, 3] may be of the scene: some lie near the cameras, or in the image of one."""
+    """Return whether points [P, 3] may belong to the scene: some lie near the cameras, or in an image."""
     rotations, centers = _poses(cameras)
     middle = centers.mean(0)
     reach = float(np.linalg.norm(centers - middle, axis=1).max()) or 1.0
@@ -165,7 +166,7 @@ def _seen_by_any(points: np.ndarray, cameras: Sequence[Camera]) -> bool:
 
 
 def _torn(points: np.ndarray) -> str | None:
-    """Describe points [P, 3] float64 far from 0 that were written in single precision; None for others."""
+    """Return a description of points [P, 3] float64 that were written in single precision, else None."""
     if not np.array_equal(points, points.astype(np.float32)):
         return None
     step = float(np.spacing(np.float32(np.abs(points).max())))
@@ -175,8 +176,8 @@ def _torn(points: np.ndarray) -> str | None:
 def _point_of_interest(rotations: np.ndarray, centers: np.ndarray) -> np.ndarray:
     """Return the point [3] closest to all optical axes in the least-squares sense.
 
-    Where the axes are almost parallel, or the point lies behind half of the cameras, as for views that look outwards,
-    return a point in front of the cameras' mean instead, at 4 times the radius of the set of cameras.
+    If the axes are almost parallel, or the point lies behind half of the cameras, as for views that look outwards, it
+    is instead a point in front of the cameras' mean, at 4 times the radius of the set of cameras.
     """
     axes = rotations[:, 2]
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -195,7 +196,7 @@ def _point_of_interest(rotations: np.ndarray, centers: np.ndarray) -> np.ndarray
 def _share_of_views(
     points: np.ndarray, rotations: np.ndarray, centers: np.ndarray, cameras: Sequence[Camera]
 ) -> np.ndarray:
-    """Return the share [P] of the cameras in whose image a point [P, 3] falls."""
+    """Return the share [P] of the cameras in whose image each point [P, 3] falls."""
     seen = np.zeros(len(points))
     for rotation, center, camera in zip(rotations, centers, cameras, strict=True):
         x, y, w = camera.K.double().numpy() @ rotation @ (points - center).T

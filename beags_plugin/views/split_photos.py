@@ -27,7 +27,7 @@ class SplitPhotos:
     """Views of one split: photos, and labels [H, W] uint16, all IGNORE where a view has no mask.
 
     Images with alpha are put on black. Images are averaged over the area of each new pixel, labels take the id at its
-    centre; both cover the camera's image from edge to edge. A subclass sets the attributes, and then the sizes.
+    centre; both cover the camera's image from edge to edge. A subclass sets the attributes, then calls ``set_sizes``.
     """
 
     cameras: AnyCameras
@@ -36,13 +36,13 @@ class SplitPhotos:
     file_sizes: list[list[int]]
 
     def set_sizes(self, scale_factor: float) -> None:
-        """Resize the cameras in place by a factor, and note the size at which files are read."""
+        """Resize the cameras in place by a factor, and record the size at which files are read."""
         if scale_factor != 1.0:
             width, height = (
                 downscaled_size(side, 1.0 / scale_factor) for side in (self.cameras.width, self.cameras.height)
             )
             resize_cameras(self.cameras, width, height)
-        # The cameras are cropped when they are straightened; the files keep this size.
+        # Straightening crops the cameras, but not the files.
         self.file_sizes = torch.cat([self.cameras.width, self.cameras.height], 1).tolist()
 
     def __len__(self) -> int:
@@ -59,7 +59,7 @@ class SplitPhotos:
         return None if alpha is None else resize_area(alpha, *self.file_sizes[image_idx])
 
     def get_full_image(self, image_idx: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Read image and alpha as the other two do, at the size of the file, which is decoded once."""
+        """Read image and alpha at the size of the file, which is decoded once."""
         path = self.image_filenames[image_idx]
         return read_image(path, lambda image: (_colors(path, image), _alpha(image)))
 

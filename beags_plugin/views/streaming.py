@@ -1,4 +1,4 @@
-"""Views read from disk when they are needed, some ahead of use: memory does not grow with their number."""
+"""Views read from disk when needed, some ahead of use, so that memory does not grow with their number."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ Load = Callable[[int], dict[str, Any]]
 
 
 class StreamedViews(Sequence[dict[str, Any]]):
-    """The data of V views, none of which is kept: each is loaded when it is asked for, or before, if it is expected.
+    """The data of V views, each loaded when it is used, or before if it is expected; none is stored.
 
-    load: returns the data of a view; threads call it. ahead: number of views that are loaded before their use.
-    workers: number of threads. labels: of all views, take the place of those that are loaded, once they are there.
+    load: returns the data of a view; threads call it. ahead: number of views loaded before their use. workers: number
+    of threads. labels: of all views; if set, they replace the loaded ones.
     """
 
     def __init__(self, load: Load, count: int, ahead: int, workers: int) -> None:
@@ -40,7 +40,7 @@ class StreamedViews(Sequence[dict[str, Any]]):
         return data
 
     def expect(self, indices: Iterable[int]) -> None:
-        """Start to load the first ``ahead`` of the views that will be asked for next, and drop others."""
+        """Start to load the first ``ahead`` of the views that will be used next, and drop others."""
         wanted = list(dict.fromkeys(indices))[: self.ahead]
         for index in set(self._coming) - set(wanted):
             self._coming.pop(index).cancel()
@@ -50,7 +50,7 @@ class StreamedViews(Sequence[dict[str, Any]]):
 
 
 class Lazy(Sequence[Any]):
-    """V items, each made anew when it is asked for."""
+    """V items, each made anew when it is used."""
 
     def __init__(self, make: Callable[[int], Any], count: int) -> None:
         self._make, self._count = make, count

@@ -18,12 +18,12 @@ from beags_plugin.core.cameras import Camera
 class View:
     """One undistorted view, on the data manager's device.
 
-    It shares the data manager's memory, or reads the files where images are streamed. Its properties are computed anew
-    each time: the images of all views in float would take four times the memory of those in bytes.
+    It shares the data manager's memory, or reads the files if images are streamed. Its properties are computed each
+    time, as the images of all views in float would take four times the memory of those in bytes.
 
-    name: the stem of the image file; where several share it, with the folders that differ, joined by "_".
-    data: returns ``image`` [H, W, 3 or more], uint8 or float32 in 0..1, and ``alpha`` [H, W] uint8 if there is any.
-    labels_of: returns [H, W] int32 class ids or IGNORE; None if the view has no mask.
+    name: the stem of the image file; if several share it, with the folders that differ, joined by "_". data: returns
+    ``image`` [H, W, 3 or more], uint8 or float32 in 0..1, and ``alpha`` [H, W] uint8 if there is any. labels_of:
+    returns [H, W] int32 class ids or IGNORE, or None if the view has no mask.
     """
 
     camera: Camera
@@ -33,18 +33,18 @@ class View:
 
     @property
     def labels(self) -> Tensor | None:
-        """[H, W] int32 class ids or IGNORE; None if the view has no mask."""
+        """Return the class ids or IGNORE, [H, W] int32; None if the view has no mask."""
         return self.labels_of()
 
     @property
     def image(self) -> Tensor:
-        """[H, W, 3] float32 in 0..1, on black where it has alpha."""
+        """Return the image [H, W, 3] float32 in 0..1, on black where it is transparent."""
         return in_unit_range(self.data()["image"])
 
     def image_on(self, background: Tensor) -> Tensor:
         """Return the image [H, W, 3] with ``background`` [3] behind what is transparent."""
-        held = self.data()
-        image, alpha = in_unit_range(held["image"]), held.get("alpha")
+        data = self.data()
+        image, alpha = in_unit_range(data["image"]), data.get("alpha")
         return image if alpha is None else image + (1.0 - alpha.float() / 255.0)[..., None] * background
 
 
@@ -54,7 +54,7 @@ def in_unit_range(pixels: Tensor) -> Tensor:
 
 
 def unique_names(files: Sequence[Path]) -> list[str]:
-    """Return the stem of each file; a stem that several share gets their folders before it, and a number if need be."""
+    """Return the stem of each file; a shared stem gets its folders before it, and a number if still needed."""
     parts = [Path(file).with_suffix("").parts for file in files]
     depth = 1
     while len({path[-depth:] for path in parts}) < len(set(parts)):

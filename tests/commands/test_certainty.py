@@ -70,7 +70,7 @@ def test_things_told_apart_are_judged_by_their_own_report_and_fewer_are_said(tmp
     (apart / "doubt.png").write_bytes(b"drawn")
     judged = certainty(run, tmp_path, None, "beags demo --data x --pick", apart)
     assert judged.level == "sure" and judged.to_json()["things"]["found"] == found
-    sentence = "Only 2 things lie apart, not 3: things that touch, or that most masks lack, take clicks."
+    sentence = "Only 2 separate things were found, not 3: click on things that touch, or that most masks lack."
     assert (sentence in judged.lines) is said and ("    beags demo --data x --pick --fresh" in judged.lines) is said
     assert write_doubt(run, tmp_path / "doubt.png", apart) and (tmp_path / "doubt.png").read_bytes() == b"drawn"
 

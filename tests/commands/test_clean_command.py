@@ -109,7 +109,7 @@ def test_every_format_is_written_back_as_it_came(tmp_path, kind, name, options):
 def test_what_is_not_written_becomes_a_ply_and_is_said(tmp_path):
     scene = replace(read_scene(write(tmp_path / "a.ply", "ply", random_surfels())), kind="run of splatfacto")
     found = format_of(tmp_path, scene)
-    assert found.exporter == "ply" and found.note == "A run of splatfacto is not written, so a .ply of 3DGS is."
+    assert found.exporter == "ply" and found.note == "A run of splatfacto cannot be written, so a .ply of 3DGS is."
 
 
 def test_changes_are_counted_by_nearest_neighbours():

@@ -108,7 +108,7 @@ SENTENCES = {
     "name.",
     f"render --load-config {RUN} --output a.png": "the film a.png is no .mp4 or .gif: give it such a name.",
     f"render --load-config {RUN} --size 5": "size is 5: give pixels from 16 to 4096.",
-    "render --load-config {tmp}/alone/config.yml --format before-after": "{tmp}/alone has kept no state before "
+    "render --load-config {tmp}/alone/config.yml --format before-after": "{tmp}/alone has no saved state from before "
     "refinement (base/): name the run that was refined, or another --format.",
     f"render --load-config {RUN} --format sheet --views 1 --size 16 --output {{tmp}}/file/x.png": "the picture "
     "{tmp}/file/x.png cannot be written (File exists): choose another place.",

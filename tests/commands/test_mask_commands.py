@@ -243,7 +243,7 @@ def test_agreement_overrules_the_mask_that_contradicts_the_others(tmp_path, caps
     for name, mask in right.items():
         write_image(data / f"masks/{name}.png", (mask > 0).astype(np.uint8))
     main(agree)
-    assert "lies apart" not in capsys.readouterr().out
+    assert "separate thing" not in capsys.readouterr().out
     names = {"0": "background", "1": "thing 1", "2": "thing 2"}
     assert json.loads((tmp_path / "apart/classes.json").read_text()) == names
     split = {name: read_id_mask(tmp_path / f"apart/masks/{name}.png") for name in sorted(right)[1:8]}

@@ -143,14 +143,14 @@ def test_without_scribbles_masks_alone_are_taken(fern, nvos, part, capsys):
     path = nvos / part
     shutil.rmtree(path) if path.is_dir() else path.unlink()
     truth("--data", fern, "--nvos", nvos)
-    assert "No scribbles are there, so no prompts are written." in capsys.readouterr().out
+    assert "There are no scribbles, so no prompts are written." in capsys.readouterr().out
     assert (fern / f"ground_truth/visible/fern/{TARGET}.png").exists() and not (fern / "prompts.json").exists()
 
 
 def test_scribbles_on_an_absent_photo_are_left_out(fern, nvos, capsys):
     (nvos / f"reference_image/fern/{REFERENCE}.JPG").rename(nvos / "reference_image/fern/IMG_1.JPG")
     truth("--data", fern, "--nvos", nvos)
-    assert "No photo here has the scribbles, so no prompts are written." in capsys.readouterr().out
+    assert "No photo of the scene has scribbles, so no prompts are written." in capsys.readouterr().out
 
 
 def test_scribbles_on_a_held_out_photo_are_told(fern, nvos, capsys):

@@ -44,8 +44,10 @@ def test_mipnerf360_takes_a_quarter_or_the_largest_copies_that_are_small_enough(
     outputs = parse(tmp_path, **AS_GIVEN)
     assert outputs.image_filenames[0].parent.name == f"images_{factor}"
     said = " ".join(capsys.readouterr().out.split())
-    assert ("images_4 are taken as they are, as in the paper (others: " in said) is (not gone)
-    lacking = "images_2 are taken as they are, 10 pixels wide, for lack of images_4, which the paper takes (others: "
+    assert ("images_4 are used as they are, as in the paper (other sizes: " in said) is (not gone)
+    lacking = (
+        "images_2 are used as they are, 10 pixels wide, as there is no images_4, which the paper uses (other sizes: "
+    )
     assert (lacking in said) is bool(gone)
     camera = camera_from_nerfstudio(outputs.cameras, 0)
     assert (camera.width, camera.height) == size
@@ -59,11 +61,11 @@ def test_mipnerf360_takes_a_quarter_or_the_largest_copies_that_are_small_enough(
 def test_a_size_that_the_user_chose_has_no_note_on_the_papers(tmp_path, layout, capsys):
     EVERY[layout][0](tmp_path)
     parse(tmp_path, layout=layout, downscale_factor=1.0)
-    assert "are taken as they are" in " ".join(capsys.readouterr().out.split()), "and so they are by a factor of 1"
+    assert "are used as they are" in " ".join(capsys.readouterr().out.split()), "and so they are by a factor of 1"
     folder = {"mipnerf360": "images_4"}.get(layout, "images")
     for options in ({"downscale_factor": 2.0}, {"images_path": Path(folder)}):
         parse(tmp_path, layout=layout, **options)
-        assert "are taken" not in capsys.readouterr().out
+        assert "are used" not in capsys.readouterr().out
 
 
 def test_mipnerf360_masks_and_ground_truth_of_both_kinds(tmp_path):

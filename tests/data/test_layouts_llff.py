@@ -39,7 +39,7 @@ def test_llff_makes_the_largest_images_as_wide_as_papers_do(tmp_path, monkeypatc
     largest = max(image_size(path)[0] for path in root.rglob("*.*") if path.suffix.lower() in files.IMAGE_SUFFIXES)
     camera = camera_from_nerfstudio(parse(root).cameras, 0)
     assert camera.width == WIDTH - 4 < largest
-    assert f"are taken {WIDTH - 4} pixels wide, as in the paper (" in " ".join(capsys.readouterr().out.split())
+    assert f"are used {WIDTH - 4} pixels wide, as in the paper (" in " ".join(capsys.readouterr().out.split())
     assert camera_from_nerfstudio(parse(root, downscale_factor=1.0).cameras, 0).width == largest
     assert "in the paper" not in capsys.readouterr().out  # that is another size
 
@@ -50,7 +50,7 @@ def test_images_of_llff_that_are_narrower_than_the_papers_are_said_to_be(tmp_pat
     write_llff(tmp_path, originals=False)
     monkeypatch.setattr(files, "LARGEST_WIDTH", papers)
     assert camera_from_nerfstudio(parse(tmp_path).cameras, 0).width == WIDTH
-    assert f"The images of images_4 are taken {words} (others: " in " ".join(capsys.readouterr().out.split())
+    assert f"The images of images_4 are used {words} (other sizes: " in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("known_by", ["images", "names", "copies"])
@@ -64,7 +64,7 @@ def test_llff_holds_out_the_view_that_nvos_scores(tmp_path, known_by, capsys):
     assert names(outputs) == sorted(["image000", "image008", *target])
     assert set(names(parse(root, images_path=Path("images_4")))) == set(stems) - set(names(outputs))
     said = " ".join(capsys.readouterr().out.split())
-    assert ("holds out IMG_4027, which no image here is called" in said) == (not target)
+    assert ("holds out IMG_4027, but no image has that name" in said) == (not target)
     assert not target or f"({2 + len(target)} held out, {target[0]} by protocol)" in said
 
 

@@ -72,7 +72,7 @@ def test_close_ups_in_which_nothing_was_found_are_unlabelled_and_not_background(
     empty = [0, 1, 3, 5, 7, 9, 11]
     given = [torch.zeros_like(mask) if view in empty else mask for view, mask in enumerate(exact)]
     found, masks = agreed(scene, given)
-    assert found.silenced == empty and not found.say[empty].any()
+    assert found.silenced == empty and not found.weights[empty].any()
     assert wrong(masks, exact) < 0.01
     assert all(int((mask.labels == 1).sum()) > 0.8 * int(true.sum()) for mask, true in zip(masks, exact, strict=True))
 

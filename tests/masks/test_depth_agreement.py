@@ -9,7 +9,7 @@ import torch
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import lift
-from beags_plugin.masks.depth_agreement import disagreement
+from beags_plugin.masks.voxel_reprojection import disagreement
 
 WIDTH, HEIGHT, FOCAL = 24, 18, 30.0
 PLACES = (0.0, 0.153, 0.251, 0.317)  # along x

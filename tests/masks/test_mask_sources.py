@@ -63,7 +63,7 @@ def test_id_images_and_colours_and_rare_ids(tmp_path):
     Image.fromarray(colors[truth(1)]).save(tmp_path / "painted/v1.jpg")
     with pytest.raises(UserError, match="is a JPEG, which blurs the colours"):
         make(IdImagesSource(folder=Path("painted"), colors=True), scene)
-    with pytest.raises(UserError, match="holds no image named as one"):
+    with pytest.raises(UserError, match="holds no image with the name of a photo"):
         make(GaussianGroupingSource(), scene)
 
 

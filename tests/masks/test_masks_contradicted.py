@@ -19,9 +19,8 @@ from PIL import Image
 from beags_plugin.commands.cli import main
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import read_id_mask, write_mask
-from beags_plugin.masks.check.areas import contradicted
 from beags_plugin.masks.check.consistency import UNSEEN, Agreement
-from beags_plugin.masks.check.contradictions import settle
+from beags_plugin.masks.check.contradictions import contradicted, settle
 from beags_plugin.masks.check.issues import percent
 from beags_plugin.pictures.masks import Changed, Pointed, contradicted_picture
 

@@ -80,7 +80,7 @@ def test_things_beyond_those_asked_for_are_background_and_said(scene):
     left_out = 1 if of[1] == 0 else 3
     for mask, true in zip(separated_labels(found, surfels, CAMERAS, given, rasterizer, SETTINGS), exact, strict=True):
         assert mask is not None and float((mask[true == left_out] == 0).float().mean()) > 0.8
-    assert found.things.sentence() == "1 more of what stands out lies apart, and is background: ask for 3."
+    assert found.things.sentence() == "1 more separate things were found and became background: ask for 3."
 
 
 def test_things_that_touch_stay_one_and_that_is_said():
@@ -89,7 +89,7 @@ def test_things_that_touch_stay_one_and_that_is_said():
     given = [(render_class_map(rasterizer, surfels, owner.int(), camera, SETTINGS)[0] > 0).int() for camera in CAMERAS]
     found = separate(decide(surfels, CAMERAS, given, rasterizer, SETTINGS, 2), surfels, 2)
     assert found.things == Things(2, 1, 0)
-    assert found.things.sentence().startswith("Only one thing lies apart, not 2: things that touch, or that most masks")
+    assert found.things.sentence().startswith("Only one separate thing was found, not 2: click on things that touch")
 
 
 def test_a_streak_links_nothing_and_parts_do_not_depend_on_scale_or_order():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from beags_plugin.masks.sources.prompts import Prompt, PromptedObject
-from beags_plugin.masks.sources.two_stage import BestLabels, Retrieval, retrieve, runs_of
+from beags_plugin.masks.sources.two_stage import BestLabels, retrieve, runs_of
 from beags_plugin.system.errors import UserError
 
 SHAPE = (6, 8)
@@ -64,9 +64,8 @@ def run(tmp_path: Path, objects, looks: str, scores=None, value=None):
         return memories[-1]
 
     detector = None if scores is None else Finding(scores)
-    options = Retrieval(threshold=0.3, strict=0.6)
     steps = []
-    notes = retrieve(objects, frame_of, names, new_memory, detector, best, options, lambda *step: steps.append(step))
+    notes = retrieve(objects, frame_of, names, new_memory, detector, best, 0.3, 0.6, lambda *step: steps.append(step))
     total = len(objects) * len(looks)
     assert steps == [(done, total) for done in range(1, total + 1)]  # each view of each object
     assert len(memories) == len(objects)  # stage 2 goes on in the memory of stage 1
@@ -83,7 +82,7 @@ def test_the_first_stage_goes_both_ways_from_the_prompts_and_reports_what_is_los
     cup = PromptedObject(1, "cup", {"v3": Prompt(BOX), "v5": Prompt(BOX)})
     notes, maps, (memory, _) = run(tmp_path, [cup], "AAAABCAA")
     assert memory.asked == [(3, 1), (5, 1), [3, 4, 5, 6, 7], [2, 1, 0]] and shown(maps) == "xxxx.xxx"
-    assert len(notes) == 1 and "cup is empty from v4 to v4" in notes[0] and "add a prompt" in notes[0]
+    assert len(notes) == 1 and "cup was not found from v4 to v4" in notes[0] and "add a prompt" in notes[0]
 
 
 def test_every_lost_frame_is_asked_and_what_is_found_joins_the_memory(tmp_path):

@@ -85,7 +85,7 @@ def test_without_masks_or_data_nothing_is_left_out_and_the_line_says_so(trained,
     assert len(extracted(trained, tmp_path / "found", "--data", str(tmp_path / "moved"))) == 25
     (trained.parent / "prepared/masks/v03.png").unlink()
     assert len(extracted(trained, tmp_path / "fewer", "--data", str(tmp_path / "moved"))) == 25 + CHIP
-    assert "nothing left out, as the masks that the run has kept do not fit its data" in capsys.readouterr().out
+    assert "nothing left out, as the masks saved in the run do not fit its data" in capsys.readouterr().out
     shutil.rmtree(trained.parent / "prepared")
     assert len(extracted(trained, tmp_path / "none", "--data", str(tmp_path / "moved"))) == 25 + CHIP
-    assert "nothing left out, as the run has kept no masks" in capsys.readouterr().out
+    assert "nothing left out, as the run has no saved masks" in capsys.readouterr().out

@@ -191,7 +191,7 @@ def test_meshes_of_a_run_lie_where_its_discs_are(trained, tmp_path, monkeypatch)
     manifest = json.loads((tmp_path / "manifest.json").read_text())
     *objects, background = manifest["objects"]
     assert background["name"] == "background" and not background["files"]
-    assert "name it, with --object" in background["left_out"][0]["reason"]
+    assert "name it with --object" in background["left_out"][0]["reason"]
     main([*arguments, str(tmp_path), "--object", "background"])
     assert (tmp_path / "background.glb").exists()
     for one in objects:

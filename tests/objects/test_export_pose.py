@@ -116,7 +116,7 @@ def test_a_file_name_of_two_photos_is_refused():
         (["--centre", "--frame", "object"], "leave one out"),
         (
             ["--up", "plane"],
-            "what 'cup' stands on is not known, as the run has kept no masks: name the direction",
+            "what 'cup' stands on is not known, as the run has no saved masks: name the direction",
         ),
     ],
 )
@@ -135,7 +135,7 @@ def test_what_stands_on_nothing_is_left_out_of_all(tmp_path):
     export(config, "--all", "--up", "plane", "--output", str(tmp_path / "out"))
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
     reasons = {one["name"]: [each["reason"] for each in one["left_out"]] for one in manifest["objects"]}
-    assert not reasons["background"] and all("no plane is seen that" in reasons[name][0] for name in ("cup", "box"))
+    assert not reasons["background"] and all("views show no plane that" in reasons[name][0] for name in ("cup", "box"))
 
 
 def test_prints_are_closed_and_as_large_as_was_said(trained, tmp_path):

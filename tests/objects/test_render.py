@@ -107,5 +107,5 @@ def test_an_unknown_format_is_refused(config):
 
 def test_a_run_that_has_kept_no_base_has_nothing_to_compare(tmp_path):
     config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"), base=False)
-    with pytest.raises(UserError, match="has kept no state before refinement"):
+    with pytest.raises(UserError, match="has no saved state from before refinement"):
         render_run(config, (), "before-after", tmp_path / "a.png", SMALL)

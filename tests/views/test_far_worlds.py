@@ -144,7 +144,7 @@ def test_seed_points_in_map_coordinates_beside_local_poses_are_not_used(tmp_path
     write_transforms(tmp_path, ply_file_path="points.ply")
     outputs = parse(tmp_path, num_random_points=50)
     assert outputs.metadata["points3D_random"]
-    assert "points.ply is not used: its points do not lie where the poses look" in capsys.readouterr().out
+    assert "points.ply is not used, because its points do not lie where the cameras look" in capsys.readouterr().out
 
 
 def test_a_world_near_0_is_normalised_as_nerfstudio_does(tmp_path, capsys):

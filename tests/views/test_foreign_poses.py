@@ -322,7 +322,7 @@ def test_what_no_camera_here_has_is_named(tmp_path, mistake):
 def test_lenses_that_no_camera_here_has_are_named(tmp_path):
     write_colmap(tmp_path, text=True)
     (tmp_path / "sparse/0/cameras.txt").write_text(f"1 FULL_OPENCV {WIDTH} {HEIGHT} 1 1 1 1 0 0 0 0 0 0 0 0\n")
-    with pytest.raises(UserError, match="COLMAP's lens FULL_OPENCV, which is not known here: undistort"):
+    with pytest.raises(UserError, match="COLMAP's lens FULL_OPENCV, which is not supported: undistort"):
         parse(tmp_path)
 
 

@@ -72,7 +72,7 @@ def test_points_of_colmap_without_colours_are_grey(tmp_path):
 def test_points_of_another_format_are_named(tmp_path, name):
     write_transforms(tmp_path, ply_file_path=name)
     (tmp_path / name).write_text("0 0 0\n")
-    with pytest.raises(UserError, match=f"the seed points .*{name} are of a format that is not read: save them as"):
+    with pytest.raises(UserError, match=f"the seed points .*{name} have a format that cannot be read: save them as"):
         parse(tmp_path)
 
 
@@ -152,7 +152,7 @@ def test_rotations_are_normalised_as_colmap_does(tmp_path):
 def test_rotations_of_no_length_are_refused(tmp_path, word):
     write_colmap(tmp_path, text=True)
     rotation(tmp_path, lambda _: word)
-    with pytest.raises(UserError, match=r"images.txt gives v00.png no pose that is a number: export the model again"):
+    with pytest.raises(UserError, match=r"images.txt gives v00.png a pose that is no number: export the model again"):
         parse(tmp_path)
 
 
@@ -162,7 +162,7 @@ def test_tables_of_llff_in_whole_numbers_and_with_none(tmp_path):
     rows = np.load(table)
     rows[2, 16] = np.nan
     np.save(table, rows)
-    with pytest.raises(UserError, match="poses_bounds.npy hold what is no finite number, such as NaN"):
+    with pytest.raises(UserError, match="poses_bounds.npy hold a value such as NaN that is not finite"):
         parse(tmp_path)
     np.save(table, rows[:, :15].astype(np.float32))
     with pytest.raises(UserError, match=re.escape("poses_bounds.npy are [10, 15] of float32 instead of [views, 17]")):
@@ -187,7 +187,7 @@ def test_missing_photos_between_numbers_that_count_from_anywhere(tmp_path, capsy
         f"1 of the {len(full.image_filenames)} photos" in (said := capsys.readouterr().out) and "IMG_4029.png" in said
     )
     (folder / "IMG_4026.png").unlink()
-    with pytest.raises(UserError, match="keep the images that the poses are of"):
+    with pytest.raises(UserError, match="keep the images that have poses"):
         parse(tmp_path, images_path=folder)
 
 

@@ -7,7 +7,7 @@ import torch
 from beags_plugin.core.cameras import Camera
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings, SurfelInputs
-from beags_plugin.views.small_views import small_camera
+from beags_plugin.views.cameras import small_camera
 
 
 def test_a_small_camera_renders_the_average_of_the_whole_picture():

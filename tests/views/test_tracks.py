@@ -69,7 +69,7 @@ def test_without_the_file_nothing_is_known(tmp_path):
         ('{"photos": ["v01"], "points": [[-1], [], []]}', "cannot be read .*negative"),
         ('{"photos": ["v01"], "points": [["v01"], [], []]}', "cannot be read"),
         ('{"photos": ["v01"], "points": 3}', "cannot be read"),
-        ('{"photos": ["v01"], "points": [[0], []]}', "tells of 2 seed points, but there are 3: delete it"),
+        ('{"photos": ["v01"], "points": [[0], []]}', "lists 2 seed points, but there are 3: delete it"),
     ],
 )
 def test_a_file_that_does_not_fit_is_told_in_one_sentence(tmp_path, content, words):

@@ -1,4 +1,4 @@
-"""Any data set with a COLMAP model, binary or text; other layouts share its functions."""
+"""Any data set with a COLMAP model, binary or text, and functions that other layouts share."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def model_folder(root: Path) -> Path | None:
 
 def missing_part(folder: Path) -> str | None:
     """Return the name of a file that a COLMAP model lacks, or None."""
-    end = "txt" if (folder / "cameras.txt").is_file() else "bin"  # the order in which nerfstudio looks
+    end = "txt" if (folder / "cameras.txt").is_file() else "bin"  # nerfstudio's order
     return next((f"{part}.{end}" for part in ("cameras", "images") if not (folder / f"{part}.{end}").is_file()), None)
 
 
@@ -43,12 +43,12 @@ def checked_model(root: Path) -> Path:
 
 
 def points_file(folder: Path) -> Path | None:
-    """Find the seed points of a COLMAP model; None without any (nerfstudio fails on an empty list).
+    """Return the file of a COLMAP model's seed points; None if there is none, or its list is empty.
 
-    A binary file without a single byte, as a download that broke off leaves it, is none of an empty list.
+    An empty binary file, as an interrupted download leaves it, is returned, so that reading it raises an error.
     """
     binary, text = folder / "points3D.bin", folder / "points3D.txt"
-    if binary.is_file():  # the order in which nerfstudio looks; the file starts with a 64-bit count
+    if binary.is_file():  # nerfstudio's order; the file starts with a 64-bit count
         with binary.open("rb") as file:
             count = file.read(8)
         return binary if any(count) or not count else None

@@ -6,16 +6,15 @@ from pathlib import Path
 
 from beags_plugin.data.dataset import ColmapModel, Dataset, Split
 from beags_plugin.data.files import choose_images, list_images, size_note
-from beags_plugin.data.layout import Layout
+from beags_plugin.data.layout import Layout, stem_of
 from beags_plugin.data.layouts.colmap import checked_model, model_folder
-from beags_plugin.system.errors import UserError
 
 
 class LerfMask(Layout):
     """images, images_train, object_mask/<stem>.png (ids), test_mask/<n>/<prompt>.png and sparse/0.
 
-    By default the images are taken as they are, as in the paper. Test views are those of images/ that images_train/
-    lacks; <n> counts them from 0 in the order of their names.
+    By default images have their own size, as in the paper. Test views are the images that images_train/ lacks; <n>
+    counts them from 0 in the order of their names.
     """
 
     title = "LERF-Mask"
@@ -44,17 +43,9 @@ class LerfMask(Layout):
 
 def _masks_by_prompt(folder: Path, test: list[str]) -> dict[str, dict[str, Path]]:
     """Find the masks of the test views by prompt and stem; raise ``UserError`` for a folder of no test view."""
-    found: dict[str, dict[str, Path]] = {}
+    masks: dict[str, dict[str, Path]] = {}
     for view in sorted(path for path in folder.iterdir() if path.is_dir()):
-        if view.name in test:
-            stem = view.name
-        elif view.name.isdigit() and int(view.name) < len(test):
-            stem = test[int(view.name)]
-        else:
-            raise UserError(
-                f"{view} is for no test view, of which there are {len(test)} (the images that images_train lacks): "
-                f"name it 0 to {len(test) - 1}, or like an image."
-            )
+        stem = stem_of(view, test, "test view")
         for file in sorted(view.glob("*.png")):
-            found.setdefault(file.stem, {})[stem] = file
-    return found
+            masks.setdefault(file.stem, {})[stem] = file
+    return masks

@@ -1,4 +1,4 @@
-"""LLFF's forward-facing scenes, with the view that NVOS scores held out."""
+"""LLFF's forward-facing scenes; the view that NVOS scores is held out."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ORIGINAL_NAMES = "original_names.txt"
 class Llff(Layout):
     """images, and poses in a complete COLMAP model, else in poses_bounds.npy.
 
-    By default the largest images, 1600 pixels wide, as in the paper, or as wide as they are if that is less.
+    By default the largest images are scaled to 1600 pixels wide, as in the paper; narrower ones keep their size.
     """
 
     title = "LLFF"
@@ -49,28 +49,29 @@ class Llff(Layout):
 
 
 def lacks_poses(root: Path) -> str | None:
-    """Describe the two sources of poses if ``root`` has neither; else None."""
+    """Return a description of the two sources of poses if ``root`` has neither; else None."""
     if root.is_dir() and ((root / FILE).is_file() or complete_model(root) is not None):
         return None
     return f"neither {FILE} nor a complete COLMAP model (sparse/0)"
 
 
 def model_or_bounds(root: Path, images: Path) -> tuple[ColmapModel | PoseTable, Path | None]:
-    """Return the poses of the images in a folder, COLMAP's, which know the lens, else LLFF's; and seed points.
+    """Return the poses of the images in a folder, and their seed points.
 
-    Smaller copies of the images may have other names in the same order, as LLFF makes them.
+    COLMAP's poses take precedence over LLFF's, as they include the lens. Smaller copies of the images may have other
+    names in the same order, as LLFF makes them.
     """
     model = complete_model(root)
     if model is not None:
         return ColmapModel(model, images, in_order=True), None
-    return read_poses_bounds(root / FILE, images), points_file(root / "sparse" / "0")  # both in one world
+    return read_poses_bounds(root / FILE, images), points_file(root / "sparse" / "0")  # poses and points share a world
 
 
 def nvos_target(root: Path, folder: Path) -> tuple[str, ...]:
-    """Return the stem in ``folder`` of the view that NVOS scores, or the camera's own stem if that is unknown.
+    """Return the stem in ``folder`` of the view that NVOS scores, or the camera's stem if that is unknown.
 
     LLFF numbers its smaller copies (image000.png, ...) in the order of the camera's names: those in images/, or the
-    second column of original_names.txt. Empty for other scenes.
+    second column of original_names.txt. Returns () for other scenes.
     """
     target = NVOS_TARGETS.get(root.name.lower())
     if target is None:
@@ -79,9 +80,9 @@ def nvos_target(root: Path, folder: Path) -> tuple[str, ...]:
 
 
 def camera_names(root: Path, folder: Path) -> dict[str, str]:
-    """Return the stem of each file of the camera to that of its copy in ``folder``, as far as they are known.
+    """Return {stem of the camera's file: stem of its copy in ``folder``}, as far as known; see ``nvos_target``.
 
-    Those of LLFF's smaller copies: see ``nvos_target``. Files of ``folder`` itself keep their names.
+    Files of ``folder`` itself keep their names.
     """
     stems = [path.stem for path in list_images(folder)]
     pairs = dict(zip((path.stem for path in _originals(root, len(stems))), stems, strict=False))
@@ -97,7 +98,7 @@ def camera_names(root: Path, folder: Path) -> dict[str, str]:
 
 
 def _columns(line: str) -> list[str]:
-    """Return the name of a copy and that of the camera's file, the rest of the line; a tab parts them, if any."""
+    """Return the name of a copy, and the rest of the line, that of the camera's file; a tab or spaces divide them."""
     return [name.strip() for name in (line.split("\t", 1) if "\t" in line else line.split(maxsplit=1))]
 
 

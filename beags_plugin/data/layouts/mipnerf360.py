@@ -16,7 +16,7 @@ FOLDERS = {"images", "images_2", "images_4", "images_8"}
 class MipNerf360(Colmap):
     """images, images_2, images_4, images_8 and sparse/0; every 8th view is for evaluation.
 
-    By default images are a quarter of the original, images_4, as in the paper; without them those of ``choose_images``.
+    By default the images of images_4 are used, as in the paper, else those of ``choose_images``.
     """
 
     title = "Mip-NeRF 360"
@@ -37,6 +37,6 @@ class MipNerf360(Colmap):
             folder, note = quarter, size_note(quarter)
         else:
             folder = choose_images(root)
-            width = f"{image_width(folder)} pixels wide, for lack of {QUARTER}, which the paper takes"
+            width = f"{image_width(folder)} pixels wide, as there is no {QUARTER}, which the paper uses"
             note = size_note(folder, f"as they are, {width}")
         return Dataset(self.title, root, ColmapModel(checked_model(root), folder), size_note=note)

@@ -1,4 +1,4 @@
-"""SPIn-NeRF: one object's masks beside the smaller copies of the images."""
+"""SPIn-NeRF: masks of one object beside the smaller copies of the images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LABELS = "label"
 class SpinNerf(Layout):
     """images_4/<image>, images_4/label/<stem>.png (or another size), and sparse/0 or poses_bounds.npy.
 
-    Views before the first labelled one, in the order of names, show the scene without the object: they are left out.
+    Views before the first labelled one, in the order of names, show the scene without the object and are left out.
     Every 8th of the others is held out.
     """
 

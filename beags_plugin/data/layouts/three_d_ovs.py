@@ -6,7 +6,7 @@ from pathlib import Path
 
 from beags_plugin.data.dataset import Dataset, Split
 from beags_plugin.data.files import largest_images, list_images, width_note
-from beags_plugin.data.layout import Layout
+from beags_plugin.data.layout import Layout, stem_of
 from beags_plugin.data.layouts.llff import lacks_poses, model_or_bounds
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import read_text, reason
@@ -37,7 +37,7 @@ class ThreeDOvs(Layout):
         visible: dict[str, dict[str, Path]] = {}
         held_out = []
         for view in sorted(path for path in (root / CLASSES).parent.iterdir() if path.is_dir()):
-            stem = _stem_of(view, stems)
+            stem = stem_of(view, stems, "image")
             held_out.append(stem)
             for name in names:
                 if (view / f"{name}.png").is_file():
@@ -65,11 +65,3 @@ def _class_names(file: Path) -> list[str]:
     if not names or len(set(names)) < len(names):
         raise UserError(f"{file} names {'a class twice' if names else 'no class'}: write one name on each line.")
     return names
-
-
-def _stem_of(view: Path, stems: list[str]) -> str:
-    if view.name in stems:
-        return view.name
-    if view.name.isdigit() and int(view.name) < len(stems):
-        return stems[int(view.name)]
-    raise UserError(f"{view} is for no image: name it like one, or with its place in the order of names, from 0.")

@@ -1,4 +1,4 @@
-"""Agreement of views about the classes of points in space."""
+"""Agreement of views on the classes of points in space."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-BAND = 0.003  # of the image diagonal: any mask is contradicted so near an outline
+BAND = 0.003  # width of the band around outlines, over the image diagonal
 UNSEEN = -1  # label of a point outside the image, behind the camera, not seen by the view, or unlabelled
-AGREEMENT = 0.6  # least share of one class in the other views' labels of a point that counts
-LEAST_OTHERS = 3  # other views that see a point that counts
-LEAST_POINTS = 8  # of an object in a view
-MOST = 0.5  # least share of an object's points with another label
+AGREEMENT = 0.6  # least share that one class must have among the other views' labels of a point that counts
+LEAST_OTHERS = 3  # least other views that must see a point that counts
+LEAST_POINTS = 8  # least points of an object in a view
+MOST = 0.5  # least share of an object's points that have one other label
 
 
 @dataclass(frozen=True)
 class Renamed:
-    """A view with exchanged ids: ``instead`` of each key it has the value, at a number of points."""
+    """A view with exchanged ids: ``instead`` maps the right rank to the view's, at ``points`` points in all."""
 
     view: int
     instead: dict[int, int]
@@ -33,24 +33,24 @@ def labels_at(xy: np.ndarray, z: np.ndarray, ranks: np.ndarray) -> np.ndarray:
     height, width = ranks.shape
     with np.errstate(invalid="ignore"):
         inside = (z > 0) & (xy[:, 0] >= 0) & (xy[:, 0] < width) & (xy[:, 1] >= 0) & (xy[:, 1] < height)
-    found = np.full(len(z), UNSEEN, np.int16)
+    labels = np.full(len(z), UNSEEN, np.int16)
     column, row = xy[inside].astype(np.int64).T
-    found[inside] = ranks[row, column]
-    return found
+    labels[inside] = ranks[row, column]
+    return labels
 
 
 def labels_around(xy: np.ndarray, ranks: np.ndarray) -> np.ndarray:
-    """Return the label of each point that a view shows, as ``labels_at``; ``UNSEEN`` in the band about outlines."""
+    """Return the label of each point that a view saw, as ``labels_at``; ``UNSEEN`` in the band around outlines."""
     ahead = np.ones(len(xy))
-    found = labels_at(xy, ahead, ranks)
+    labels = labels_at(xy, ahead, ranks)
     for angle in np.arange(8) * np.pi / 4:
         beside = xy + band(*ranks.shape) * np.array([np.cos(angle), np.sin(angle)])
-        found[labels_at(beside, ahead, ranks) != found] = UNSEEN
-    return found
+        labels[labels_at(beside, ahead, ranks) != labels] = UNSEEN
+    return labels
 
 
 def band(height: int, width: int) -> int:
-    """Return the width, in pixels, of the band about outlines in which any mask is contradicted."""
+    """Return the width, in pixels, of the band around outlines in which any two masks differ."""
     return max(1, round(BAND * math.hypot(height, width)))
 
 
@@ -58,7 +58,7 @@ class Agreement:
     """Labels of P points in all views, and the confusion of each view with the others.
 
     labels: [P, V] int16 ranks below ``classes``, or ``UNSEEN``; see ``labels_at``. Rank 0 is the background.
-    least: other views that see a point that counts.
+    least: least other views that must see a point that counts.
     """
 
     def __init__(self, labels: np.ndarray, classes: int, least: int = LEAST_OTHERS) -> None:
@@ -72,7 +72,7 @@ class Agreement:
         self._compare()
 
     def silence(self, views: Sequence[int]) -> None:
-        """Take back the votes of some views, which are still compared with the others."""
+        """Take the votes of some views away; they are still compared with the others."""
         for view in views:
             seen = np.flatnonzero(self.labels[:, view] != UNSEEN)
             self.votes[seen, self.labels[seen, view]] -= 1
@@ -90,7 +90,7 @@ class Agreement:
 
     def _compare(self) -> None:
         self.confusion = np.stack([self._confusion(view) for view in range(len(self.voting))])
-        """[V, C, C]: points with the row's class in the other views and the column's in the view."""
+        """Number of points with the row's class in the other views and the column's in the view, [V, C, C]."""
 
     def _confusion(self, view: int) -> np.ndarray:
         points, winner = self.against_others(view)
@@ -99,7 +99,7 @@ class Agreement:
 
     def renamed(self) -> list[Renamed]:
         """Find views with exchanged ids (an exchange with the background inverts the mask), or with a new id."""
-        return [found for view in range(len(self.confusion)) for found in self._renamed(view)]
+        return [renamed for view in range(len(self.confusion)) for renamed in self._renamed(view)]
 
     def _renamed(self, view: int) -> list[Renamed]:
         confusion = self.confusion[view]
@@ -115,14 +115,14 @@ class Agreement:
                 exchanged += self._cycle(given, start)
         shares = {rank: confusion[rank, new] / points[rank] for rank, new in given.items()}
         for new in sorted(set(given.values()) - {0}):
-            # no view places this id: the object has a new one, as has what it hides
+            # No other view has this id, so the object, and what it hides, has a new one in this view.
             if self.confusion[:, new].sum() < LEAST_POINTS:
                 exchanged.append({max((r for r in given if given[r] == new), key=lambda rank: shares[rank]): new})
         return [Renamed(view, pairs, sum(int(confusion[pair]) for pair in pairs.items())) for pairs in exchanged]
 
     @staticmethod
     def _cycle(given: dict[int, int], start: int) -> list[dict[int, int]]:
-        """Return the ring of exchanged classes, as a ↔ b, that begins with ``start``; or none."""
+        """Return the cycle of exchanged classes, such as a ↔ b, that begins with ``start``; empty without one."""
         path = [start]
         while (following := given.get(path[-1])) is not None and following not in path:
             path.append(following)
@@ -130,7 +130,7 @@ class Agreement:
 
 
 def ranks_of(labels: np.ndarray, ids: Sequence[int], ignore: int) -> np.ndarray:
-    """Return [H, W] int16, the index of each class id in ``ids`` (sorted); ``UNSEEN`` for IGNORE and other ids."""
+    """Return the index of each class id in the sorted ``ids``, [H, W] int16; ``UNSEEN`` for IGNORE and other ids."""
     table = np.full(ignore + 1, UNSEEN, np.int16)
     table[np.asarray(ids, np.int64)] = np.arange(len(ids))
     return table[labels]

@@ -10,22 +10,22 @@ from beags_plugin.masks.check.consistency import AGREEMENT, LEAST_POINTS, MOST, 
 from beags_plugin.masks.check.files import Coverage, MaskFiles
 from beags_plugin.masks.check.issues import Issue, named, percent
 
-HARDLY = 0.1  # of the most pixels that an object has in a view: with fewer, a view does not show it
+HARDLY = 0.1  # least pixels of an object in a view that shows it, as a share of the most that any view has
 
 
 def views_against_others(
     agreement: Agreement, files: MaskFiles, coverage: Coverage, names: Mapping[int, str]
 ) -> list[Issue]:
-    """Describe the disagreements as issues; ranks of ``agreement`` are indices in ``coverage.ids``."""
+    """Return an issue for each disagreement; ranks of ``agreement`` are indices in ``coverage.ids``."""
     titles = [f"{i} ({names[i]})" for i in coverage.ids]
     absent = _absent(agreement, files, coverage, titles)
     groups: dict[tuple[tuple[int, int], ...], list[int]] = {}
-    for found in agreement.renamed():
-        groups.setdefault(tuple(sorted(found.instead.items())), []).append(found.view)
+    for renamed in agreement.renamed():
+        groups.setdefault(tuple(sorted(renamed.instead.items())), []).append(renamed.view)
     issues = list(absent.values())
     for pairs, views in groups.items():
         (true, new), *more = pairs
-        alone = true == 0 and not more  # no exchange: nothing else in the view is called background
+        alone = true == 0 and not more  # no exchange, as nothing else in the view became background
         if alone and new in absent:
             continue
         ranks = sorted({new for _, new in pairs} - {0})
@@ -48,28 +48,29 @@ def views_against_others(
 
 
 def _absent(agreement: Agreement, files: MaskFiles, coverage: Coverage, titles: list[str]) -> dict[int, Issue]:
-    """Find objects, by rank, that most views should show, as the masks of the other views say, and do not."""
+    """Find objects, by rank, that most views should show according to the other masks, but lack."""
     trained, issues = np.asarray(files.trained) & coverage.usable, {}
     for rank in range(1, len(titles)):
         labels = agreement.labels[agreement.votes[:, rank] > 0]
         pixels = np.where(trained, coverage.pixels[:, rank], 0)
-        for shown in (pixels > 0, pixels > HARDLY * pixels.max()):  # the second where slivers outvote whole objects
-            showing = np.flatnonzero(shown).tolist()
-            inside, seen = (found.sum(1) for found in (labels[:, shown] == rank, labels[:, shown] != UNSEEN))
+        # The second try leaves out slivers, where they outvote whole objects.
+        for shows in (pixels > 0, pixels > HARDLY * pixels.max()):
+            showing = np.flatnonzero(shows).tolist()
+            inside, seen = (points.sum(1) for points in (labels[:, shows] == rank, labels[:, shows] != UNSEEN))
             agreed = labels[(inside >= min(2, len(showing))) & (inside >= AGREEMENT * seen)]
             if showing and len(agreed) >= LEAST_POINTS:
                 break
         else:
             continue
-        background = (agreed == 0).mean(0)  # neither beside the image nor behind another object
-        lacking: list[int] = np.flatnonzero(trained & ~shown & (background >= MOST)).tolist()
+        background = (agreed == 0).mean(0)  # share of these points that a view labels background
+        lacking: list[int] = np.flatnonzero(trained & ~shows & (background >= MOST)).tolist()
         if len(lacking) > len(showing):
             stems = tuple(files.stems[view] for view in lacking)
             issues[rank] = Issue(
                 "warning",
                 "absent",
                 f"{_only(files, showing)} {titles[rank]}, but {len(lacking)} more views of {int(trained.sum())} should "
-                f"and have hardly any of it or none ({named(stems)}): {_remedy(len(showing))}",
+                f"show it too and have little or none of it ({named(stems)}): {_remedy(len(showing))}",
                 f"{len(lacking)} views vote for the background there, {len(showing)} for the object; a view without a "
                 "mask does not vote",
                 stems,

@@ -1,4 +1,4 @@
-"""Checks of mask files alone: missing, wrong size or type, ids without a name, objects in few views."""
+"""Checks of each mask file by itself: missing, wrong size or type, ids without a name, objects in few views."""
 
 from __future__ import annotations
 
@@ -18,18 +18,20 @@ from beags_plugin.masks.check.issues import STOPS, Issue, named, percent
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.pasted import command
 
-FEW_VIEWS = 3  # an object needs two other views to outvote one
-MOST_IDS = 256  # in one file, or compared between views, with memory of their square
-LARGE_IGNORE = 0.2  # least share of unlabelled pixels in a note
+FEW_VIEWS = 3  # least views of an object: two are needed to outvote one
+MOST_IDS = 256  # most ids in a file, and in a comparison of views, whose memory grows with their square
+LARGE_IGNORE = 0.2  # least share of unlabelled pixels that a note reports
+NO_MASKS = "training stops before its first step (beags-base needs no masks)"
 
 
 @dataclass(frozen=True)
 class MaskFiles:
     """The views of a scene and their masks.
 
-    stems: names of the V images (``data.files.photo_names``); sizes: (width, height) of their files; masks: file or
-    None. folder: of the masks. kind, ignore_ids: see ``labels.classes.read_mask``. trained: False for held-out views.
-    names: id to name from the user or the layout, or None; names_file: their file. photos: the files of the views.
+    stems: names of the V images (``data.files.photo_names``). sizes: (width, height) of their files. masks: file of
+    each view, or None. folder: of the masks. kind, ignore_ids: see ``labels.classes.read_mask``. trained: False for
+    held-out views. names: id to name from the user or the layout, or None. names_file: their file. photos: the files of
+    the views.
     """
 
     stems: Sequence[str]
@@ -44,27 +46,23 @@ class MaskFiles:
     photos: Sequence[Path] = ()
 
     def read(self, view: int) -> np.ndarray | None:
-        """Read [H, W] uint16 class ids or IGNORE of a view; None without a mask; raise ``UserError``."""
+        """Read the class ids or IGNORE of a view, [H, W] uint16; None without a mask; raise ``UserError``."""
         path = self.masks[view]
         return None if path is None else read_mask(path, self.kind, self.ignore_ids)
 
     def paths(self, views: Sequence[int]) -> str:
         """Name the masks of some views: the first by its path, the others by their paths below the folder."""
-        found = [path for view in views if (path := self.masks[view]) is not None]
-        return named(
-            [
-                path.relative_to(self.folder) if i and path.is_relative_to(self.folder) else path
-                for i, path in enumerate(found)
-            ]
-        )
+        masks = [path for view in views if (path := self.masks[view]) is not None]
+        below = (path.relative_to(self.folder) if path.is_relative_to(self.folder) else path for path in masks[1:])
+        return named([*masks[:1], *below])
 
 
 @dataclass
 class Coverage:
     """Pixels of each id in every view.
 
-    ids: sorted, without IGNORE. pixels: [V, C]; ignored, size: [V] unlabelled and all pixels, 0 without a usable mask.
-    usable: [V] bool, False without a readable mask of the right size.
+    ids: sorted, without IGNORE. pixels: [V, C]. ignored, size: [V], unlabelled and all pixels; 0 without a usable mask.
+    usable: [V] bool, whether the view has a readable mask of the right size.
     """
 
     ids: list[int]
@@ -78,7 +76,7 @@ class Coverage:
 def check_files(
     files: MaskFiles, few_views: int = FEW_VIEWS, progress: Callable[[int, int], None] | None = None
 ) -> Coverage:
-    """Read every mask once; mistakes in files become issues instead of errors."""
+    """Read every mask once, and report mistakes in files as issues."""
     views = len(files.stems)
     counts: list[dict[int, int] | None] = [None] * views
     issues: list[Issue] = []
@@ -88,7 +86,7 @@ def check_files(
         if path is None:
             return None
         try:
-            size = image_size(path)  # of the header: what is far too large is not decoded
+            size = image_size(path)  # read from the header, so that a far too large image is not decoded
             if size != tuple(files.sizes[view]):
                 return _wrong_size(files, view, size)
             labels = files.read(view)
@@ -97,10 +95,16 @@ def check_files(
         except UserError as error:
             return Issue("error", "type", str(error), STOPS, (files.stems[view],))
         assert labels is not None
-        found = np.bincount(labels.ravel(), minlength=IGNORE + 1)
-        if np.count_nonzero(found) > MOST_IDS:
-            return _no_id_image(files, view, np.count_nonzero(found))
-        return {int(i): int(found[i]) for i in np.flatnonzero(found)}
+        pixels = np.bincount(labels.ravel(), minlength=IGNORE + 1)
+        if (ids := np.count_nonzero(pixels)) > MOST_IDS:
+            return Issue(
+                "error",
+                "no id image",
+                f"the mask {path} holds {ids} different ids: this is no id image (a photo? depth?), replace it.",
+                "training stops, or, without a classes.json, treats every value as an object",
+                (files.stems[view],),
+            )
+        return {int(i): int(pixels[i]) for i in np.flatnonzero(pixels)}
 
     with ThreadPoolExecutor(max_workers=4) as pool:  # decoding a .png releases the interpreter
         for view, found in enumerate(pool.map(look, range(views))):
@@ -116,7 +120,7 @@ def check_files(
     coverage.issues += [*_missing(files), *_no_object(files, coverage), *_strays(files), *_names(files, coverage)]
     if any(files.masks) and (sentence := turned_note(files.photos)) is not None:
         coverage.issues.append(
-            Issue("note", "stored turned", sentence, "upright masks would lie wrong in the photos, unnoticed")
+            Issue("note", "stored turned", sentence, "upright masks would be misplaced in the photos, unnoticed")
         )
     coverage.issues += [*_few_views(files, coverage, few_views), *_unlabelled(files, coverage)]
     return coverage
@@ -142,29 +146,14 @@ def _coverage(counts: Sequence[Mapping[int, int] | None]) -> Coverage:
 
 def _wrong_size(files: MaskFiles, view: int, found: tuple[int, ...]) -> Issue:
     width, height = files.sizes[view]
-    mask = files.masks[view]
+    sentence, mask = None, files.masks[view]
     if files.photos and mask is not None:
         sentence = upright_mask_error(mask, (found[0], found[1]), files.photos[view], (width, height))
-        if sentence is not None:
-            return Issue("error", "size", sentence, STOPS, (files.stems[view],))
-    return Issue(
-        "error",
-        "size",
-        f"the mask {files.masks[view]} is {found[0]}x{found[1]} pixels but its image is {width}x{height}: "
-        "make it from the image at its full size, or scale it by nearest neighbour.",
-        STOPS,
-        (files.stems[view],),
+    sentence = sentence or (
+        f"the mask {mask} is {found[0]}x{found[1]} pixels but its image is {width}x{height}: "
+        "make it from the image at its full size, or scale it by nearest neighbour."
     )
-
-
-def _no_id_image(files: MaskFiles, view: int, ids: int) -> Issue:
-    return Issue(
-        "error",
-        "no id image",
-        f"the mask {files.masks[view]} holds {ids} different ids: this is no id image (a photo? depth?), replace it.",
-        "training stops, or, without a classes.json, takes every value for an object",
-        (files.stems[view],),
-    )
+    return Issue("error", "size", sentence, STOPS, (files.stems[view],))
 
 
 def _make(files: MaskFiles) -> str:
@@ -182,7 +171,7 @@ def _missing(files: MaskFiles) -> Iterator[Issue]:
             "missing",
             f"no training view has a mask in {files.folder}: put id images there, named as the images, or make "
             f"them with: {_make(files)}",
-            "training stops before its first step (beags-base needs no masks)",
+            NO_MASKS,
             tuple(without),
         )
     elif without:
@@ -192,7 +181,7 @@ def _missing(files: MaskFiles) -> Iterator[Issue]:
             f"{len(without)} of {len(trained)} training views have no mask in {files.folder}: {named(without)}; "
             "add them, or leave it to reprojection.",
             f"{percent(len(without), len(trained))} of the views do not vote; reprojection labels them from the "
-            "others, and with --pipeline.model.prepare.reprojection none no loss about masks looks at them",
+            "others, and with --pipeline.model.prepare.reprojection none no mask loss uses them",
             tuple(without),
         )
 
@@ -205,7 +194,7 @@ def _no_object(files: MaskFiles, coverage: Coverage) -> Iterator[Issue]:
             "no object",
             f"no mask of a training view in {files.folder} names an object, all are background or unlabelled: give "
             f"objects ids above 0, or make masks with: {_make(files)}",
-            "training stops before its first step (beags-base needs no masks)",
+            NO_MASKS,
         )
 
 
@@ -220,7 +209,7 @@ def _strays(files: MaskFiles) -> Iterator[Issue]:
             "unused",
             f"{len(others)} files in {files.folder} are not used ({named([path.name for path in others], 3)}), as "
             f"{why}: rename them after their images or save them as .png; those of photos without a pose may stay.",
-            "what they show does not count",
+            "training does not use them",
         )
 
 
@@ -266,7 +255,7 @@ def _few_views(files: MaskFiles, coverage: Coverage, few_views: int) -> Iterator
             f"id {class_id} ({name}) is in {len(views)} of {int(trained.sum())} training views "
             f"({files.paths(views) or 'only held-out views'}), fewer than {few_views}: mask it in more views, or set "
             "it to 0 if it is a mistake.",
-            f"its {pixels} pixels can hardly outvote or be outvoted: sides that no mask shows go to other classes",
+            f"its {pixels} pixels can hardly be checked by votes: sides that no mask shows go to other classes",
             tuple(files.stems[view] for view in views),
         )
 
@@ -280,5 +269,5 @@ def _unlabelled(files: MaskFiles, coverage: Coverage) -> Iterator[Issue]:
             "unlabelled",
             f"{percent(ignored, total)} of the masks' pixels are unlabelled, most in {files.paths(most[:3])}: fine if "
             "nobody knows what is there, else label them (background is 0).",
-            f"{ignored} pixels do not vote, and boundary and silhouette loss do not look at them",
+            f"{ignored} pixels do not vote, and boundary and silhouette loss ignore them",
         )

@@ -1,4 +1,4 @@
-"""Findings of a check: the file, the mistake, the remedy, and the cost of leaving it."""
+"""Issues that a check of masks reports: the mistake, the remedy, and the cost of leaving it."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ STOPS = "training stops when it reads this file"
 class Issue:
     """A mistake in the masks, or a possible one.
 
-    level: "error": training refuses it; "warning": it costs quality; "note": fine if intended.
-    kind: a short word for similar issues. message: file or object, mistake, remedy.
-    cost: of leaving it, with figures. views: stems of the images concerned. objects: class ids concerned, if one is.
+    level: "error", training refuses it; "warning", it costs quality; "note", fine if intended. kind: a short name that
+    similar issues share. message: file or object, mistake, remedy. cost: what the mistake costs, with figures. views:
+    stems of the images concerned. objects: class ids concerned.
     """
 
     level: Level
@@ -38,9 +38,9 @@ def ordered(issues: Sequence[Issue]) -> list[Issue]:
 
 
 def named(items: Sequence[object], most: int = 5) -> str:
-    """List the first few of many items, and the number of the others."""
-    shown = ", ".join(str(item) for item in items[:most])
-    return shown if len(items) <= most else f"{shown} and {len(items) - most} more"
+    """Return the first ``most`` items as a list in words, and the number of the others."""
+    listed = ", ".join(str(item) for item in items[:most])
+    return listed if len(items) <= most else f"{listed} and {len(items) - most} more"
 
 
 def percent(part: float, whole: float) -> str:

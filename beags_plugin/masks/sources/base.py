@@ -1,4 +1,4 @@
-"""The interface of mask sources, their input and their output."""
+"""The interface of mask sources, with their input and output."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ class NothingFound(UserError):
 
 @dataclass(frozen=True)
 class Photo:
-    """A view: its name (``data.files.photo_names``), its file, its size in pixels; trained: not held out.
+    """The photo of a view.
 
-    turned: EXIF's orientation of the file where masks are made of upright photos, whose size and pixels these are.
+    name: see ``data.files.photo_names``. path: of the file. width, height: pixels. trained: False if held out. turned:
+    EXIF's orientation of the file if masks are made of the upright photo, to which width and height then refer; else 1.
     """
 
     name: str
@@ -40,19 +41,18 @@ class Photo:
     turned: int = 1
 
     def pixels(self) -> np.ndarray:
-        """Read [H, W, 3] uint8 RGB."""
-        # a copy: torch needs writable memory
+        """Read the photo, [H, W, 3] uint8 RGB, in writable memory, as torch needs it."""
         return upright(read_image(self.path, lambda image: np.array(image.convert("RGB"))), self.turned)
 
     def upright(self) -> Photo:
-        """Return the photo as EXIF says that one holds it."""
+        """Return the photo turned upright by its EXIF orientation."""
         turned = orientation(self.path)
         sides = (self.height, self.width) if turned in LYING else (self.width, self.height)
         return replace(self, width=sides[0], height=sides[1], turned=turned)
 
 
 class Geometry(Protocol):
-    """Shape of the scene from a trained run, for all its views, without lens distortion."""
+    """Cameras and depth of all views of a trained run, without lens distortion."""
 
     @property
     def images(self) -> Sequence[Path]:
@@ -61,11 +61,11 @@ class Geometry(Protocol):
 
     @property
     def cameras(self) -> Sequence[Camera]:
-        """Cameras without distortion, of the photos' size."""
+        """Cameras of the photos' size."""
         ...
 
     def depth(self, view: int) -> Tensor:
-        """Return [h, w] float32, depth of the surface, 0 without one."""
+        """Return the depth of the surface, [h, w] float32, world units along z; 0 without one."""
         ...
 
     def to_straight(self, labels: np.ndarray, view: int) -> np.ndarray:
@@ -79,7 +79,7 @@ class Geometry(Protocol):
 
 @dataclass(frozen=True)
 class SourceScene:
-    """The scene of a source. root: its folder. geometry: None without a trained run."""
+    """The scene that a source masks. root: its folder. geometry: None without a trained run."""
 
     root: Path
     photos: Sequence[Photo]
@@ -91,16 +91,24 @@ class SourceScene:
         return PhotoNames([photo.name for photo in self.photos])
 
     def by_photo(self, files: Mapping[str, Path]) -> dict[str, Path]:
-        """Return the file of each photo that the name of a file means, by the photo's name; raise ``UserError``."""
+        """Return the file of each photo, by the photo's name; files: by their own names; raise ``UserError``."""
         return {self.photos[index].name: path for index, path in self.names.assigned(files, str).items()}
 
     def index_of(self, name: str, whose: str) -> int:
-        """Return the index of the view that ``name`` means; ``whose`` is the source of the name, for errors."""
-        found = self.names.find(name, whose)
-        if found is None:
-            raise UserError(f"{whose} names the view {name!r}, but no image of {self.root} is called so: correct it.")
-        return found
+        """Return the index of the view called ``name``; raise ``UserError``. whose: file that names it, for errors."""
+        index = self.names.find(name, whose)
+        if index is None:
+            raise UserError(f"{whose} names the view {name!r}, but {self.root} has no image of that name: correct it.")
+        return index
 
+    def prompted_view(self, name: str, path: Path) -> int:
+        """Return the index of a view that the prompts in ``path`` name; raise ``UserError`` also if it is held out."""
+        index = self.index_of(name, str(path))
+        if not self.photos[index].trained or (self.geometry is not None and index not in self.places):
+            raise UserError(f"{path} has prompts in {name}, which is held out: prompt a training view.")
+        return index
+
+    @cached_property
     def places(self) -> list[int]:
         """Return the photo index of each view of ``geometry``; raise ``UserError`` for another scene."""
         assert self.geometry is not None
@@ -114,7 +122,7 @@ class SourceScene:
         return [known[image.resolve()] for image in self.geometry.images]
 
     def below(self, path: Path) -> Path:
-        """Return the path below the scene's folder if it exists there; else the path itself."""
+        """Return the path below the scene's folder if it exists there, else the path itself."""
         inside = self.root / path
         return inside if not path.is_absolute() and inside.exists() else path
 
@@ -123,8 +131,8 @@ class SourceScene:
 class MadeMasks:
     """Class names by id, and per photo its labels [H, W] uint16, or None.
 
-    notes: sentences for the user, filled while maps are made. to_look_at: indices of photos whose maps serve neither
-    training nor evaluation.
+    notes: sentences for the user, added while the maps are made. to_look_at: indices of photos whose maps are only for
+    looking at, not for training or evaluation.
     """
 
     names: Mapping[int, str]
@@ -137,7 +145,7 @@ class MaskSource(ABC):
     """Interface of the sources: frozen dataclasses whose fields are their options.
 
     needs_run: True if ``SourceScene.geometry`` is needed. guesses: True if a program draws the masks, so that they are
-    no truth to evaluate with; views known as held out get none. False if it reads masks made elsewhere.
+    no ground truth, and held-out views get none; False if the source reads masks made elsewhere.
     """
 
     needs_run: ClassVar[bool] = False
@@ -149,7 +157,7 @@ class MaskSource(ABC):
         return None
 
     def check(self) -> None:  # noqa: B027  (most sources need no weights)
-        """Raise ``UserError`` where the weights that the options name cannot be had: before other work is done."""
+        """Raise ``UserError``, before other work is done, if the weights that the options name are not available."""
 
     @abstractmethod
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
@@ -174,7 +182,7 @@ def per_photo(
         progress(index + 1, len(scene.photos))
 
 
-def stacked(objects: Sequence[tuple[int, np.ndarray]], shape: tuple[int, int]) -> np.ndarray:
+def stacked(objects: Sequence[tuple[int, np.ndarray]], shape: tuple[int, ...]) -> np.ndarray:
     """Combine masks [H, W] bool of objects by id into labels [H, W] uint16; smaller objects cover larger ones."""
     labels = np.zeros(shape, np.uint16)
     for class_id, mask in sorted(objects, key=lambda pair: (-int(pair[1].sum()), pair[0])):

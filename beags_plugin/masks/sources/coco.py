@@ -1,4 +1,4 @@
-"""Source for COCO's JSON: run lengths or polygons."""
+"""Source of masks: COCO's JSON, with run lengths or polygons."""
 
 from __future__ import annotations
 
@@ -15,17 +15,16 @@ from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progre
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import load_json, reason
 
-FARTHEST = 1e5  # pixels of a polygon's points from the image's corner; the library rasterizes all of them
+FARTHEST = 1e5  # largest coordinate of a polygon's points, pixels; the library rasterizes all of them
 INSTANCE_KEYS = ("instance_id", "track_id", "object_id")
 
 
 @dataclass(frozen=True)
 class CocoSource(MaskSource):
-    """COCO annotations: ``images``, ``annotations`` with a ``segmentation`` (RLE, compressed or not, or polygons),
-    ``categories``.
+    """COCO annotations: ``images``, ``categories``, and ``annotations`` with a ``segmentation``, RLE or polygons.
 
-    file: the JSON. by: the key of an object: "category", or "instance" for instance_id, track_id or object_id. Smaller
-    objects cover larger ones.
+    file: the JSON. by: what makes annotations one object: "category", or "instance" for the same instance_id, track_id
+    or object_id. Smaller objects cover larger ones.
     """
 
     file: Path = Path("annotations.json")
@@ -45,12 +44,12 @@ class CocoSource(MaskSource):
             raise UserError(
                 f"{path} is no COCO JSON with images and annotations ({reason(error)}): export it again."
             ) from error
-        meant = scene.names.assigned(
+        names_of = scene.names.assigned(
             {name: name for name in views.values()}, lambda name: f"the image {name} of {path}"
         )
-        if not set(meant.values()) & {view for view, _, _ in annotations}:
+        if not set(names_of.values()) & {view for view, _, _ in annotations}:
             raise UserError(f"{path} annotates no image of {scene.root}: its file_name must be theirs.")
-        # numbers come before words
+        # Numbers come before words.
         keys = sorted({key for _, key, _ in annotations}, key=lambda key: [(isinstance(k, str), k) for k in key])
         if len(keys) > IGNORE - 1:
             raise UserError(f"{path} has {len(keys)} objects: only {IGNORE - 1} ids can be saved.")
@@ -58,7 +57,7 @@ class CocoSource(MaskSource):
         of_view: dict[str, list[tuple[int, Any]]] = defaultdict(list)
         for view, key, entry in annotations:
             of_view[view].append((ids[key], entry.get("segmentation")))
-        annotated = {scene.photos[index].name: view for index, view in meant.items()}
+        annotated = {scene.photos[index].name: view for index, view in names_of.items()}
 
         def read(photo: Photo) -> np.ndarray | None:
             if photo.name not in annotated:
@@ -95,7 +94,7 @@ def _number_or_word(value: Any) -> int | str:
 
 
 def _check_size(path: Path, photo: Photo, size: tuple[Any, Any]) -> None:
-    """Raise ``UserError`` where the JSON tells another (width, height) of an image than its photo has."""
+    """Raise ``UserError`` if the JSON gives an image another (width, height) than its photo has."""
     if not all(type(side) is int for side in size) or size == (photo.width, photo.height):
         return
     whose = f"of {photo.name} in {path}"
@@ -108,9 +107,9 @@ def _check_size(path: Path, photo: Photo, size: tuple[Any, Any]) -> None:
 
 
 def packed_total(counts: str) -> int:
-    """Sum the run lengths in COCO's packed text: 5 bits a character, each length minus the one before the last.
+    """Sum the run lengths in COCO's packed text: 5 bits a character, each length stored minus the one two before.
 
-    Raises ``ValueError`` for other text and for a length below 0; the library checks neither.
+    Raises ``ValueError`` for other text and for negative lengths, neither of which the library checks.
     """
     lengths: list[int] = []
     value = shift = 0
@@ -126,7 +125,7 @@ def packed_total(counts: str) -> int:
             value -= 1 << shift
         length = value + (lengths[-2] if len(lengths) > 2 else 0)
         if length < 0:
-            raise ValueError("a run is shorter than nothing")
+            raise ValueError("a run has a negative length")
         lengths.append(length)
         value = shift = 0
     if shift:
@@ -135,18 +134,18 @@ def packed_total(counts: str) -> int:
 
 
 def _check_polygons(polygons: Any) -> None:
-    """Raise ``ValueError`` unless these are lists of at least three points x, y near the image."""
+    """Raise ``ValueError`` unless each polygon is a list x, y, ... of at least three points near the image."""
     if not isinstance(polygons, list) or not polygons:
         raise ValueError("it is no list of polygons")
     for polygon in polygons:
         if not isinstance(polygon, list) or len(polygon) < 6 or len(polygon) % 2:
             raise ValueError("a polygon is no list of three points or more")
         if not all(type(value) in (int, float) and abs(value) < FARTHEST for value in polygon):
-            raise ValueError("a polygon has a point that lies in no image")
+            raise ValueError("a polygon has a point far outside the image")
 
 
 def decoded(segmentation: Any, shape: tuple[int, int], where: str) -> np.ndarray:
-    """Decode an annotation, {"size", "counts"} or a list of polygons, to [H, W] bool; ``where`` names it in errors."""
+    """Decode {"size", "counts"} or a list of polygons to [H, W] bool. where: names the annotation in errors."""
     from pycocotools import mask
 
     coco: Any = mask  # its types are incomplete
@@ -167,7 +166,7 @@ def decoded(segmentation: Any, shape: tuple[int, int], where: str) -> np.ndarray
                 runs = coco.frPyObjects(segmentation, height, width)
             else:
                 if not isinstance(counts, str):
-                    raise ValueError("its counts are neither a list nor text")
+                    raise ValueError("the counts are neither a list nor text")
                 if (total := packed_total(counts)) != height * width:
                     raise ValueError(f"the counts sum to {total}")
                 runs = {"size": [height, width], "counts": counts.encode("ascii")}

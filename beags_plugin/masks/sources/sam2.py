@@ -1,4 +1,4 @@
-"""Source by two-stage retrieval with the video models of SAM 2 and SAM 3, from the library transformers."""
+"""Source of masks: two-stage retrieval with the video models of SAM 2 and SAM 3, from the library transformers."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ import torch
 
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene
 from beags_plugin.masks.sources.prompts import Prompt, read_prompts
-from beags_plugin.masks.sources.two_stage import BestLabels, Box, Retrieval, retrieve
+from beags_plugin.masks.sources.two_stage import BestLabels, Box, retrieve
 from beags_plugin.system.errors import UserError
 
-KEPT_FRAMES = 16  # of an object's memory about the tracked frame; the models use 15 at most
-# the library's classes, of the model and of its processor, by the model type that the weights' config names
+KEPT_FRAMES = 16  # frames around the tracked one that an object's memory keeps; the models use at most 15
+# Classes of the model and of its processor, by the model type that the config of the weights names.
 TRACKERS = {
     "sam2_video": ("Sam2VideoModel", "Sam2VideoProcessor"),
     "sam3_video": ("Sam3TrackerVideoModel", "Sam3TrackerVideoProcessor"),
@@ -35,12 +35,12 @@ DETECTORS = {
 
 @dataclass(frozen=True)
 class Sam2Source(MaskSource):
-    """SAM 2 or SAM 3 tracks objects through the training views in the order of names, from points, boxes, or texts.
-    Held-out views are never seen: a mask that a program made of them is no truth.
+    """Objects that SAM 2 or SAM 3 tracks through the training views in the order of names, from points, boxes or texts.
 
     prompts: JSON, see ``prompts.read_prompts``. model, detector: a folder with the library's files, or a name on its
-    hub; the detector is loaded only if an object has a text: "auto" is SAM 3 itself, or Grounding DINO for SAM 2.
-    device: "auto" prefers CUDA. threshold, strict: see ``two_stage.Retrieval``. local: never use the hub.
+    hub. The detector is loaded only if an object has a text; "auto" is SAM 3 itself, or Grounding DINO for SAM 2.
+    device: "auto" prefers CUDA. threshold: least score of a detection in stage 1. strict: the same in stage 2, where a
+    wrong detection would add an object that is not there. local: never use the hub.
     """
 
     guesses: ClassVar[bool] = True
@@ -69,12 +69,9 @@ class Sam2Source(MaskSource):
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         path = scene.below(self.prompts)
         objects = read_prompts(path)
-        trained = [index for index, photo in enumerate(scene.photos) if photo.trained]
-        photos = [scene.photos[index] for index in trained]
-        prompted = {view: scene.index_of(view, str(path)) for one in objects for view in one.prompts}
-        if held_out := sorted(view for view, index in prompted.items() if index not in trained):
-            raise UserError(f"{path} has prompts in {held_out[0]}, which is held out: prompt a training view.")
-        frame_of = {view: trained.index(index) for view, index in prompted.items()}
+        photos = [photo for photo in scene.photos if photo.trained]
+        views = {view for one in objects for view in one.prompts}
+        frame_of = {view: photos.index(scene.photos[scene.prompted_view(view, path)]) for view in sorted(views)}
         device = self.device
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -88,7 +85,6 @@ class Sam2Source(MaskSource):
         tracker = load(self.model, trackers, self.local)
         detector = TextDetector(*load(finder, detectors, self.local), photos, device) if detectors else None
         names = {0: "background", **{one.class_id: one.name for one in objects}}
-        options = Retrieval(self.threshold, self.strict)
         notes: list[str] = []
 
         def maps() -> Iterator[np.ndarray | None]:
@@ -96,7 +92,11 @@ class Sam2Source(MaskSource):
                 best = BestLabels(Path(folder))
                 names = [photo.name for photo in photos]
                 new_memory = partial(SamMemory, *tracker, photos, device)
-                notes.extend(retrieve(objects, frame_of, names, new_memory, detector, best, options, progress))
+                notes.extend(
+                    retrieve(
+                        objects, frame_of, names, new_memory, detector, best, self.threshold, self.strict, progress
+                    )
+                )
                 frames = iter(range(len(photos)))
                 for photo in scene.photos:
                     yield best.labels(next(frames), (photo.height, photo.width)) if photo.trained else None
@@ -117,7 +117,7 @@ def model_type(name: str, local: bool = False) -> str:
 
 
 def classes(name: str, kinds: Mapping[str, tuple[str, str]], what: str, local: bool = False) -> list[Any]:
-    """Return the classes that ``kinds`` has for the model type of weights; raise ``UserError`` if it has none."""
+    """Return the classes in ``kinds`` for the model type of some weights; raise ``UserError`` without any."""
     import transformers  # pyright: ignore[reportMissingImports]
 
     kind = model_type(name, local)
@@ -133,7 +133,7 @@ def classes(name: str, kinds: Mapping[str, tuple[str, str]], what: str, local: b
 
 
 def load(name: str, loaders: Sequence[Any], local: bool = False) -> tuple[Any, Any]:
-    """Load a model and its processor by their classes from a folder or the hub; raise ``UserError``."""
+    """Load a model and its processor, of the classes ``loaders``, from a folder or the hub; raise ``UserError``."""
     from safetensors import SafetensorError
 
     try:
@@ -153,8 +153,8 @@ def _not_loaded(name: str, error: Exception) -> UserError:
 class SamMemory:
     """A session of SAM 2 or SAM 3 as a ``two_stage.Memory``.
 
-    What it holds is bounded, but for the memories of prompted frames: frames are read when needed, and memories of
-    tracked frames that the model no longer uses are dropped.
+    Its memory is bounded, except for prompted frames: frames are read when needed, and memories of tracked frames that
+    the model no longer uses are dropped.
     """
 
     def __init__(self, model: Any, processor: Any, photos: Sequence[Photo], device: str = "cpu") -> None:
@@ -180,8 +180,8 @@ class SamMemory:
             original_size=(photo.height, photo.width),
             **inputs,
         )
-        # The library keeps a prompt in memory only if its frame was not tracked before, and tracked frames about a lost
-        # one would tell that the object is absent.
+        # The library keeps a prompt in memory only if its frame was not tracked before, and tracked frames around a
+        # lost one would tell the model that the object is absent.
         for tracked in self.session.frames_tracked_per_obj.values():
             tracked.pop(frame, None)
         for outputs in self.session.output_dict_per_obj.values():
@@ -201,7 +201,7 @@ class SamMemory:
             self._forget(frame)
 
     def _forget(self, frame: int) -> None:
-        """Drop memories of tracked frames far from ``frame``, and masks of full size, which have been encoded."""
+        """Drop memories of tracked frames far from ``frame``, and full-size masks that have been encoded."""
         for outputs in self.session.output_dict_per_obj.values():
             tracked = outputs["non_cond_frame_outputs"]
             for old in [other for other in tracked if abs(other - frame) > KEPT_FRAMES]:
@@ -211,7 +211,7 @@ class SamMemory:
 
 
 class _Frames(dict):
-    """The frames of a session, read and prepared on demand; the last one is kept."""
+    """The frames of a session, read and prepared on demand; only the last one stays in memory."""
 
     def __init__(self, processor: Any, photos: Sequence[Photo]) -> None:
         super().__init__()
@@ -238,17 +238,17 @@ class TextDetector:
         photo, text = self.photos[frame], text.strip()
         grounding = hasattr(self.processor, "post_process_grounded_object_detection")
         if grounding:
-            text = text.lower().rstrip(".") + "."  # the model is trained on such phrases
+            text = text.lower().rstrip(".") + "."  # the model was trained on lower case with a full stop
         inputs = self.processor(images=photo.pixels(), text=text, return_tensors="pt").to(self.device)
         config = self.model.config
         if inputs["input_ids"].shape[1] > getattr(config, "max_text_len", config.text_config.max_position_embeddings):
             raise UserError(f"the text {text!r} is too long for the detector: name the object in a few words.")
         output, sizes = self.model(**inputs), [(photo.height, photo.width)]
         if grounding:
-            found = self.processor.post_process_grounded_object_detection(
+            result = self.processor.post_process_grounded_object_detection(
                 output, inputs["input_ids"], threshold=threshold, target_sizes=sizes
             )[0]
         else:
-            found = self.processor.post_process_object_detection(output, threshold=threshold, target_sizes=sizes)[0]
-        boxes = [tuple(float(value) for value in box) for box in found["boxes"]]
-        return [(box, float(score)) for box, score in zip(boxes, found["scores"], strict=True)]  # type: ignore[misc]
+            result = self.processor.post_process_object_detection(output, threshold=threshold, target_sizes=sizes)[0]
+        boxes = [tuple(float(value) for value in box) for box in result["boxes"]]
+        return [(box, float(score)) for box, score in zip(boxes, result["scores"], strict=True)]  # type: ignore[misc]

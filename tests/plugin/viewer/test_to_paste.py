@@ -17,7 +17,7 @@ from nerfstudio.viewer.export_panel import show_command_modal
 from run_folders import write_scene, write_trained
 from viewer_windows import Window
 
-from beags_plugin.objects.camera_path import read_camera_path
+from beags_plugin.objects.render import read_camera_path
 from beags_plugin.plugin.viewer.to_paste import show_to_paste, to_paste
 
 

@@ -19,7 +19,7 @@ from nerfstudio.process_data.colmap_utils import parse_colmap_camera_params
 
 from beags_plugin.data.frame_cameras import LENS
 from beags_plugin.plugin.views.dataparser import nerfstudio_cameras
-from beags_plugin.views.cameras import CAMERA_TYPES, FISHEYE, PERSPECTIVE, SceneCameras, intrinsics
+from beags_plugin.views.cameras import CAMERA_TYPES, FISHEYE, PERSPECTIVE, SceneCameras, camera_from_nerfstudio
 from beags_plugin.views.colmap_files import colmap_cameras
 from beags_plugin.views.colmap_model import read_cameras, rotation_of
 from beags_plugin.views.lens import straighten, undistort_image
@@ -81,7 +81,7 @@ def test_colmap_cameras_are_alike(tmp_path):
         try:
             entries = parse_colmap_camera_params(SimpleNamespace(**camera._asdict()))
         except NotImplementedError:
-            with pytest.raises(Exception, match=f"lens {camera.model}, which is not known"):
+            with pytest.raises(Exception, match=f"lens {camera.model}, which is not supported"):
                 colmap_cameras(one)
             continue
         found = colmap_cameras(one)[index]
@@ -103,9 +103,9 @@ def test_photos_lose_their_lens_alike(kind):
     theirs: Cameras = nerfstudio_cameras(cameras)
     image = np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8)
     K = theirs.get_intrinsics_matrices()[0].numpy()
-    assert (intrinsics(cameras, 0).numpy() == K).all()
+    assert (camera_from_nerfstudio(cameras, 0).K.numpy() == K).all()
     new_K, straight, _ = _undistort_image(theirs[0], np.array(lens, np.float32), {}, image.copy(), K)
     assert (undistort_image(image, cameras, 0) == straight).all()
     straighten(cameras)
     assert (int(cameras.width[0]), int(cameras.height[0])) == straight.shape[1::-1]
-    assert (intrinsics(cameras, 0).numpy() == np.float32(new_K)).all()
+    assert (camera_from_nerfstudio(cameras, 0).K.numpy() == np.float32(new_K)).all()

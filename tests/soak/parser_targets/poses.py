@@ -37,10 +37,11 @@ def _colmap(path: Path) -> object:
 def _transforms(path: Path) -> None:
     from beags_plugin.data.dataset import TransformsFile
     from beags_plugin.views.cameras import check_cameras
-    from beags_plugin.views.poses import Normalization, read_poses
+    from beags_plugin.views.data_options import DataOptions
+    from beags_plugin.views.poses import read_poses
 
     pictures()
-    views = read_poses(TransformsFile(path), path.parent, Normalization("up", "poses", True, 1.0, 1.0))
+    views = read_poses(TransformsFile(path), path.parent, DataOptions())
     check_cameras(views.cameras, views.images)
 
 
