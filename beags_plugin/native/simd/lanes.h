@@ -1,15 +1,8 @@
-// Defines vectors of 32 bytes for the ops: 8 float32 or 4 float64 lanes, as GCC's and clang's vector extensions, which
-// any instruction set can lower. Files that include it are compiled for one instruction set each, so everything lies in
-// the namespace BEAGS_ISA; otherwise the linker would merge the copies.
+// Defines what the ops' kernels compute on vectors of 32 bytes, 8 float32 or 4 float64 lanes (vectors.h), on any
+// instruction set.
 #pragma once
 
-#include <math.h>
-#include <stdint.h>
-#if defined(__AVX__)
-#include <immintrin.h>
-#endif
-
-#include "simd/device.h"
+#include "simd/vectors.h"
 
 namespace beags {
 namespace ops {
@@ -18,67 +11,21 @@ namespace BEAGS_ISA {
 typedef uint64_t Words __attribute__((vector_size(32)));
 
 template <class T>
-struct Lanes;
-
-template <>
-struct Lanes<float> {
-  typedef float Real __attribute__((vector_size(32)));
-  typedef int32_t Whole;
-  typedef int32_t Int __attribute__((vector_size(32)));  // also a mask: 0 or -1
-  typedef uint32_t Bits __attribute__((vector_size(32)));
-  static constexpr int kCount = 8;
-};
-
-template <>
-struct Lanes<double> {
-  typedef double Real __attribute__((vector_size(32)));
-  typedef int64_t Whole;
-  typedef int64_t Int __attribute__((vector_size(32)));
-  typedef uint64_t Bits __attribute__((vector_size(32)));
-  static constexpr int kCount = 4;
-};
+using Lanes = beags::BEAGS_ISA::Vectors<T, 32>;
 
 using RealF = Lanes<float>::Real;
 using IntF = Lanes<float>::Int;
 using RealD = Lanes<double>::Real;
 using IntD = Lanes<double>::Int;
 
-BEAGS_INLINE RealF fma(RealF a, RealF b, RealF c) {
-#if defined(__FMA__)
-  return _mm256_fmadd_ps(a, b, c);
-#else
-  return a * b + c;
-#endif
-}
-BEAGS_INLINE RealD fma(RealD a, RealD b, RealD c) {
-#if defined(__FMA__)
-  return _mm256_fmadd_pd(a, b, c);
-#else
-  return a * b + c;
-#endif
-}
+using beags::BEAGS_ISA::fused;
+using beags::BEAGS_ISA::root;
+using beags::BEAGS_ISA::select;
 
-BEAGS_INLINE RealF sqrt(RealF x) {
-#if defined(__AVX__)
-  return _mm256_sqrt_ps(x);
-#else
-  for (int i = 0; i < 8; ++i) x[i] = sqrtf(x[i]);
-  return x;
-#endif
-}
-BEAGS_INLINE RealD sqrt(RealD x) {
-#if defined(__AVX__)
-  return _mm256_sqrt_pd(x);
-#else
-  for (int i = 0; i < 4; ++i) x[i] = ::sqrt(x[i]);
-  return x;
-#endif
-}
-
-template <class R, class I>
-BEAGS_INLINE R select(I mask, R yes, R no) {
-  return (R)(((I)yes & mask) | ((I)no & ~mask));
-}
+BEAGS_INLINE RealF fma(RealF a, RealF b, RealF c) { return fused(a, b, c); }
+BEAGS_INLINE RealD fma(RealD a, RealD b, RealD c) { return fused(a, b, c); }
+BEAGS_INLINE RealF sqrt(RealF x) { return root(x); }
+BEAGS_INLINE RealD sqrt(RealD x) { return root(x); }
 
 // Returns NaN where x is not finite, else 0.
 template <class R>

@@ -6,10 +6,8 @@
 
 #include <math.h>
 #include <stdint.h>
-#if defined(__x86_64__)
+#if defined(__AVX512F__)
 #include <immintrin.h>
-#elif defined(__ARM_NEON)
-#include <arm_neon.h>
 #endif
 
 #include "simd/device.h"
@@ -20,10 +18,8 @@
 #include "simd/simd_scalar.h"
 #elif defined(__AVX512F__)
 #include "simd/simd_avx512.h"
-#elif defined(__AVX2__)
-#include "simd/simd_avx2.h"
 #else
-#include "simd/simd_generic.h"
+#include "simd/simd_vectors.h"
 #endif
 
 namespace beags {
