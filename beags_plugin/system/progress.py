@@ -53,9 +53,9 @@ def progress_bar(name: str, passing: bool = False) -> Iterator[Callable[[int, in
             progress.stop()
 
 
-def say(message: str) -> None:
-    """Print a line as it is, above the bar if one is shown: on the console that bars use."""
-    get_console().print(message, highlight=False, markup=False, soft_wrap=True)
+def say(message: str, warning: bool = False) -> None:
+    """Print a line as it is, above the bar if one is shown: on the console that bars use. warning: in yellow."""
+    get_console().print(message, style="yellow" if warning else None, highlight=False, markup=False, soft_wrap=True)
 
 
 def counted(items: Iterable[Item], total: int, progress: Callable[[int, int], None]) -> Iterator[Item]:

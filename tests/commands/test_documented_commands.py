@@ -21,7 +21,7 @@ from run_folders import write_camera_path, write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
-from beags_plugin.commands import cli, more
+from beags_plugin.commands import cli
 from beags_plugin.splat_io.ply import write_ply
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -158,7 +158,7 @@ def test_a_documented_command_works(folder, monkeypatch, document, line):
 
 def test_commands_in_the_text_exist():
     """Every `beags NAME` in the text is a subcommand."""
-    known = {command.__name__.lower() for command in typing.get_args(cli.Command)} | {*more.COMMANDS.names()}
+    known = {command.__name__.lower() for command in typing.get_args(cli.Command)} | {*cli.COMMANDS.names()}
     for document in DOCUMENTS:
         named = set(re.findall(r"`beags ([a-z][a-z-]+)", document.read_text("utf8")))
         assert named <= known, f"{document.name}: {named - known}"

@@ -317,6 +317,6 @@ def test_what_lacks_for_masks_is_said_before_poses_are_computed(photos, tmp_path
     model = photos / "outputs/walk/scene/colmap/sparse/0/cameras.bin"  # of an earlier demo inside the photos' folder
     model.parent.mkdir(parents=True)
     model.touch()
-    with pytest.raises(UserError, match=r"none can be made of what stands out: no onnxruntime\."):
+    with pytest.raises(UserError, match=r"the source salient cannot make any: no onnxruntime\."):
         scene_setup.made_scene(photos, tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -1,4 +1,4 @@
-"""Markdown text of a viewer's panel; names may hold anything."""
+"""Markdown text of a viewer's panel; names may contain any character."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 
 from beags_plugin.labels.colors import colorize
 
-WORDS_APART = '{" "}'  # between the words of a command
-_LONGEST = 40  # characters of a name that the panel's width has room for
+WORDS_APART = '{" "}'  # It stands between the words of a command.
+_LONGEST = 40  # Characters of a name that fit into the panel's width.
 
 
 @dataclass(frozen=True)
 class LegendRow:
-    """A class of the legend. count: of its Gaussians. state: any but "shown" is struck out."""
+    """A class of the legend. count: number of its Gaussians. state: any but "shown" is struck out."""
 
     class_id: int
     name: str
@@ -41,12 +41,12 @@ def swatch(class_id: int) -> str:
 
 
 def wrapped(text: str) -> str:
-    """Return a text of which no word, such as a path, is wider than the panel."""
+    """Return a text whose long words, such as paths, are broken at the panel's width."""
     return f'<div style={{{{overflowWrap: "anywhere"}}}}>{_literal(text)}</div>'
 
 
 def pasteable(command: str) -> str:
-    """Return a command to copy: one click chooses all of it. No line ends after the hyphen of an option."""
+    """Return a command to copy: one click selects all of it. No line breaks after the hyphen of an option."""
     style = '{{whiteSpace: "pre-wrap", overflowWrap: "anywhere", userSelect: "all", fontSize: "0.8em"}}'
     whole = '{{display: "inline-block", maxWidth: "100%"}}'
     words = [f"<span style={whole}>{_literal(word)}</span>" if word else "" for word in command.split(" ")]
@@ -54,7 +54,7 @@ def pasteable(command: str) -> str:
 
 
 def _literal(text: str) -> str:
-    """Return text as a JavaScript string of MDX; no part of it is taken for Markdown, or for a picture by viser."""
+    """Return text as a JavaScript string of MDX, so that neither Markdown nor viser interprets any of it."""
     return f"{{{json.dumps(text)}}}".replace("!", "\\u0021").replace("<", "\\u003c")
 
 
@@ -77,15 +77,15 @@ def capitalised(message: object) -> str:
 
 
 def escaped(text: str) -> str:
-    """Return text for Markdown, which viser reads as MDX: braces and angle brackets would be taken for a program."""
+    """Return text for Markdown with special characters escaped; viser reads MDX, which runs what braces enclose."""
     plain = set(" .,:;%…")
     return "".join(c if c.isalnum() or c in plain else f"&#{ord(c)};" for c in text)
 
 
 def unique_labels(classes: Mapping[int, str]) -> dict[str, int]:
-    """Return a drop-down's entries for the classes, to their ids, in the order of ids: names, if need be with the id.
+    """Return unique labels of the classes for a drop-down, label to id, in the order of ids.
 
-    Browsers refuse a list with two equal entries, or an empty one.
+    A label is the name, with the id if the name is empty or repeated: browsers reject equal and empty entries.
     """
     names = [shortened(name) for name in classes.values()]
     labels: dict[str, int] = {}

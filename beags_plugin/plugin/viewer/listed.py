@@ -1,4 +1,4 @@
-"""The classes that a viewer lists: those that have Gaussians, under the names that the model now has."""
+"""The classes that a viewer lists: those that have Gaussians, under their present names."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from beags_plugin.plugin.viewer.legend import unique_labels
 
 
 class Listed:
-    """What was listed last. labels: unique label to class id, ascending. counts: class id to number of Gaussians."""
+    """The list. labels: unique label to class id, ascending. counts: class id to number of Gaussians."""
 
     def __init__(self) -> None:
         self.labels: dict[str, int] = {}
@@ -15,7 +15,7 @@ class Listed:
         self._key: tuple | None = None
 
     def refresh(self, model: SceneModel) -> bool:
-        """List the classes of a model anew if they have changed; return whether they have."""
+        """Update the list if the model's classes have changed; return whether they have."""
         ids = model.class_ids
         assigned, names = bool(model.assigned), tuple(model.classes.items())
         key = (assigned, ids.data_ptr(), len(ids), ids._version, id(model.objects), names)

@@ -1,4 +1,4 @@
-"""Commands that nerfstudio's tabs Render and Export show, quoted and wrapped so that a terminal takes them."""
+"""Quote and wrap the commands in nerfstudio's tabs Render and Export, so that they work in a terminal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _PATHS = ("--load-config", "--camera-path-filename", "--output-path", "--output-
 
 
 def show_to_paste(gui: GuiApi) -> None:
-    """Let a page show nerfstudio's commands as ``to_paste`` writes them. gui: the page's own, which has little else."""
+    """Let a page show nerfstudio's commands as ``to_paste`` writes them. gui: the page's own."""
     shown = gui.add_markdown
 
     def show(content: str, *arguments: Any, **options: Any) -> Any:
@@ -26,21 +26,20 @@ def show_to_paste(gui: GuiApi) -> None:
 
 
 def to_paste(text: str) -> str:
-    """Return a text with a command of nerfstudio's as Markdown that shows all of it, with quoted paths.
+    """Return Markdown that shows all of a nerfstudio command, with quoted paths; other texts stay as they are.
 
-    A camera path is rendered by ``beags render`` too, which comes first: it needs no ffmpeg. Other texts stay as they
-    are.
+    For a camera path ``beags render``, which needs no ffmpeg, comes first.
     """
-    if (found := _SHOWN.fullmatch(text)) is None:
+    if (match := _SHOWN.fullmatch(text)) is None:
         return text
-    program, *options = re.split(r" (?=--)", found["command"].strip())
+    program, *options = re.split(r" (?=--)", match["command"].strip())
     values = {name: value for name, _, value in (option.partition(" ") for option in options)}
     theirs = " ".join([program, *(_option(*each) for each in values.items())])
     if program != "ns-render camera-path":
-        return f"{found['before']}\n\n{pasteable(theirs)}"
+        return f"{match['before']}\n\n{pasteable(theirs)}"
     words = ["--load-config", values["--load-config"], "--camera-path", values["--camera-path-filename"]]
     ours = command(["beags", "render", *words])
-    return f"{found['before']}\n\n{pasteable(ours)}\n\nor, where ffmpeg is installed,\n\n{pasteable(theirs)}"
+    return f"{match['before']}\n\n{pasteable(ours)}\n\nor, where ffmpeg is installed,\n\n{pasteable(theirs)}"
 
 
 def _option(name: str, value: str) -> str:

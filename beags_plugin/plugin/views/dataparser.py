@@ -36,7 +36,7 @@ class BeagsDataParserConfig(DataOptions, DataParserConfig):
 
 
 class PlacedOutputs(DataparserOutputs):
-    """nerfstudio's outputs with a ``dataparser_transform`` [3, 4] in double precision, by which cameras go back too."""
+    """nerfstudio's outputs with ``dataparser_transform`` [3, 4] in double precision, which also inverts poses."""
 
     def transform_poses_to_original_space(
         self, poses: Tensor, camera_convention: Literal["opengl", "opencv"] = "opencv"
@@ -50,12 +50,12 @@ class PlacedOutputs(DataparserOutputs):
 
 
 class BeagsDataParser(SceneData, DataParser):
-    """Parser behind ``beags-data``: ``SceneData`` with nerfstudio's outputs, whose metadata are its ``SplitData``'s."""
+    """Parser behind ``beags-data``: ``SceneData`` with nerfstudio's outputs; metadata are those of ``SplitData``."""
 
     config: BeagsDataParserConfig
 
     def __init__(self, config: BeagsDataParserConfig) -> None:
-        print_user_errors_plainly()  # under other methods too
+        print_user_errors_plainly()  # Other methods may use this parser too.
         DataParser.__init__(self, config)
         SceneData.__init__(self, config)
 
@@ -72,12 +72,12 @@ class BeagsDataParser(SceneData, DataParser):
 
 
 def nerfstudio_cameras(cameras: SceneCameras) -> Cameras:
-    """Return cameras as nerfstudio has them."""
+    """Return nerfstudio's cameras."""
     return Cameras(**{each.name: getattr(cameras, each.name) for each in fields(cameras)})
 
 
 def __getattr__(name: str) -> DataParserSpecification:
-    """Return the target of nerfstudio's entry point, ``beags_data``, which the first program to ask for it prepares."""
+    """Return ``beags_data``, the target of nerfstudio's entry point, after preparing the program that reads it."""
     if name != "beags_data":
         raise AttributeError(name)
     prepare()

@@ -1,6 +1,6 @@
-"""What nerfstudio's programs do with a run of ours before they have imported nerfstudio's own methods.
+"""Prepare nerfstudio's programs for a run of ours, before they import nerfstudio's own methods.
 
-One warning comes before any code of ours: ``torch.jit.script`` in nerfstudio's cameras, which our data parser needs.
+One warning comes before any code of ours: of ``torch.jit.script`` in nerfstudio's cameras, which our data parser needs.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from beags_plugin.system.program import path_option, program_name
 
 PROGRAMS = ("ns-viewer", "ns-render", "ns-eval", "ns-export")
 _OF_OURS = b"!!python/object:beags_plugin."
-_VIDEOS = ("camera-path", "interpolate", "spiral")  # modes of ns-render that ask for ffmpeg, for images too
+_VIDEOS = ("camera-path", "interpolate", "spiral")  # Modes of ns-render that need ffmpeg, even for images.
 
 
 def prepare_reading() -> None:
-    """Make a program that opens a run of ours quieter; end ns-render with one sentence where it would fail later.
+    """Silence warnings in a program that opens a run of ours; exit from ns-render with one sentence if it would fail.
 
     Other programs, and runs of other methods, are left as they are.
     """
@@ -36,16 +36,16 @@ def _is_ours(path: Path) -> bool:
     try:
         with path.open("rb") as file:
             return file.read(len(_OF_OURS)) == _OF_OURS
-    except OSError:  # nerfstudio says so
+    except OSError:  # Nerfstudio reports it.
         return False
 
 
 def _cannot_render(mode: str, config_path: Path) -> str | None:
-    """Return why a mode of ns-render fails, and the command that does not; None if it works."""
+    """Return why a mode of ns-render fails, and a command that works; None if the mode works."""
     words = ["beags", "render", "--load-config", str(config_path)]
-    if mode == "spiral":  # it asks for rays of single pixels, as splatfacto has none either
+    if mode == "spiral":  # It needs rays of single pixels, which splatfacto does not have either.
         return (
-            "ns-render spiral takes no method that trains on whole photos: take ns-render interpolate, or swing before "
+            "ns-render spiral needs a method that trains on single rays: use ns-render interpolate, or swing before "
             f"the objects with {command([*words, '--turn', '60'])}"
         )
     if mode not in _VIDEOS or shutil.which("ffmpeg") is not None:
@@ -54,5 +54,5 @@ def _cannot_render(mode: str, config_path: Path) -> str | None:
         words += ["--camera-path", str(path_option("--camera-path-filename") or "camera_path.json")]
     if (output := path_option("--output-path")) is not None:
         words += ["--output", str(output)]
-    shown = "" if mode == "camera-path" else ", which turns about the objects"
-    return f"ns-render {mode} needs ffmpeg, which is not installed; this needs none{shown}: {command(words)}"
+    path = "" if mode == "camera-path" else " and turns about the objects"
+    return f"ns-render {mode} needs ffmpeg, which is not installed; this command needs none{path}: {command(words)}"

@@ -1,6 +1,6 @@
-"""What ns-train does with a method of ours before it has imported nerfstudio's own.
+"""Prepare ns-train for a method of ours, before it imports nerfstudio's own methods.
 
-nerfstudio loads data parsers of other packages first, long before their methods: so our data parser prepares the rest.
+Nerfstudio loads data parsers of other packages long before their methods, so our data parser calls this.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from beags_plugin.system.shipped import shipped_names
 
 
 def prepare() -> None:
-    """Make ns-train of a preset of ours quicker and quieter; end it with one sentence if the preset is misspelt.
+    """Make ns-train of a preset of ours quicker and quieter; exit with one sentence if the preset is misspelt.
 
     Other programs, and ns-train with other methods, are left as they are.
     """
@@ -33,10 +33,10 @@ def prepare() -> None:
 
 
 def _leave_out_other_methods() -> None:
-    """Spare what nerfstudio does at each start for methods other than the one that has been named.
+    """Skip nerfstudio's work at each start for methods other than the named one.
 
-    It walks over all modules of the process for every method that it could install, and imports torch's compiler for
-    one function of splatfacto.
+    For every method that could be installed it walks over all modules of the process, and for one function of
+    splatfacto it imports torch's compiler.
     """
     from nerfstudio.configs import external_methods
     from nerfstudio.utils import misc
