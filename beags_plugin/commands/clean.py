@@ -47,7 +47,7 @@ def clean_scene(
     if polish < 0 or (steps is not None and steps < 1):
         raise UserError("--polish is 0 or more, and --steps 1 or more.")
     imported = read_scene(path)
-    wanted, output = format_of(path, imported), output or Path("outputs") / f"{path.stem}_cleaned"
+    written, output = format_of(path, imported), output or Path("outputs") / f"{path.stem}_cleaned"
     volume = imported.gaussians.log_scales.shape[1] == 3
     del imported
     run = output / "run"
@@ -65,7 +65,7 @@ def clean_scene(
     with progress_bar("Evaluating") as progress:
         metrics = evaluated.metrics(progress=progress)
     before, after = evaluated.stages["before"].surfels(), evaluated.stages["after"].surfels()
-    files = write_back(config, wanted, output, path.stem, objects)
+    files = write_back(config, written, output, path.stem, objects)
     report = {
         "scene": str(path.absolute()),
         "files": [str(file) for file in files],
@@ -78,7 +78,7 @@ def clean_scene(
     for line in [
         *figures(report["start"], metrics),
         str(changed),
-        *filter(None, [wanted.note]),
+        *filter(None, [written.note]),
         *turned(report["start"]),
     ]:
         CONSOLE.print(line)

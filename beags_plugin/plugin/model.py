@@ -23,7 +23,7 @@ from beags_plugin.options.scene_options import fixed_background
 from beags_plugin.plugin.training.callbacks import training_callbacks
 from beags_plugin.plugin.training.scene_model import LastRender, SceneModel
 from beags_plugin.plugin.viewer.panel import ObjectPanel, ViewerLink
-from beags_plugin.plugin.viewer.viewing import Viewing, asked_by_viewer, scene_outputs
+from beags_plugin.plugin.viewer.viewing import Viewing, called_by_viewer, scene_outputs
 from beags_plugin.rasterizers.interface import RasterOutputs, SurfelInputs
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.system.devices import to_device_async
@@ -36,7 +36,7 @@ class BeagsModel(SceneModel):
 
     def populate_modules(self) -> None:
         """Build the Gaussians from the seed points of the data."""
-        Model.populate_modules(self)  # not SplatfactoModel's: that one loads weights and calls .cuda()
+        Model.populate_modules(self)  # SplatfactoModel's would load weights and call .cuda().
         self.collider = None
         if self.seed_points is None:
             raise ValueError("the data supplies no seed points; use the data parser beags-data, which always does")
@@ -62,7 +62,7 @@ class BeagsModel(SceneModel):
             return self._training_outputs(camera)
         with torch.no_grad():
             view = camera_from_nerfstudio(camera, 0).to(self.device)
-            return self.viewing.outputs(view) if asked_by_viewer() else scene_outputs(self, view)
+            return self.viewing.outputs(view) if called_by_viewer() else scene_outputs(self, view)
 
     def _training_outputs(self, cameras: Cameras) -> dict[str, Any]:
         self.clock.mark("data")

@@ -206,7 +206,7 @@ class BeagsTrainer(Trainer):
             )
             self.keep("held_out", self.curve)
         self.keep("random", GlobalRandom())
-        self._checkpoints.all_are_kept()
+        self._checkpoints.drop_loaded_states()
         try:
             with self._interrupts:
                 super().train()
@@ -263,7 +263,7 @@ class BeagsTrainer(Trainer):
         if self.training_state == "paused":
             self.training_state = "training"
 
-    def stop_if_asked(self, step: int) -> None:
+    def stop_if_requested(self, step: int) -> None:
         """Save the step before ``step`` and end, if a signal asked for that or memory is running out."""
         if self._interrupts.asked is not None:
             if step > self._start_step:

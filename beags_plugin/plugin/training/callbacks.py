@@ -46,7 +46,7 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
         trainer.keep("curves", curves)
 
     def before(step: int) -> None:
-        trainer.stop_if_asked(step)
+        trainer.stop_if_requested(step)
         model.step = step
         every = trainer.config.logging.steps_per_log
         model.measuring = every > 0 and step % every == 0  # Nerfstudio reads only these steps' metrics.

@@ -99,7 +99,7 @@ class Checkpoints:
             except _MISFITS as error:
                 raise _misfit(self._loaded_from, error, name) from error
 
-    def all_are_kept(self) -> None:
+    def drop_loaded_states(self) -> None:
         """Drop the loaded states of parts that this run does not have."""
         self._loaded_states = {}
 

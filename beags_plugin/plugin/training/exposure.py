@@ -92,8 +92,8 @@ def exposures_of_run(model: SceneModel, datamanager: BeagsDataManager) -> PhotoE
     None if the photos have one exposure, or if there are no tracks of points to compare them by. With the option "on"
     they then begin at the identity.
     """
-    wanted = model.config.exposure
-    if wanted == "off":
+    option = model.config.exposure
+    if option == "off":
         model.exposures = None
         return None
     names = tuple(view.name for view in datamanager.views("train"))
@@ -102,13 +102,13 @@ def exposures_of_run(model: SceneModel, datamanager: BeagsDataManager) -> PhotoE
         of_name = dict(zip(known.names, known.affine.cpu(), strict=True))
         of_photos = [of_name.get(name, identity) for name, identity in zip(names, start, strict=True)]
         return PhotoExposures(model, Exposures(names, torch.stack(of_photos)))
-    if wanted == "auto" and datamanager.config.photos == "objects":
+    if option == "auto" and datamanager.config.photos == "objects":
         return None  # The objects turned in a light that stood still, which changes their brightness too.
     if (measured := photo_gains(datamanager)) is None:
-        return PhotoExposures(model, Exposures(names, start)) if wanted == "on" else None
+        return PhotoExposures(model, Exposures(names, start)) if option == "on" else None
     noise = float(np.median(measured.noise))
     differ = max(measured.spread, measured.spread_of_colors) > max(LEAST_SPREAD, CERTAIN * noise)
-    learned = wanted == "on" or differ
+    learned = option == "on" or differ
     for line in _lines(measured, names, learned):
         say(line)
     return _at_gains(model, names, measured) if learned else None

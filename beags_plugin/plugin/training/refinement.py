@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from threading import Lock
@@ -29,6 +29,7 @@ from beags_plugin.runs.prepared import prepared_labels, read_grid
 from beags_plugin.runs.write import write_run
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import counted, progress_bar, say
+from beags_plugin.views.views import View
 
 NOTHING_TO_SAVE = -1  # It stands for no step.
 
@@ -184,8 +185,7 @@ class RefinementSwitch:
         with self.trainer.long_stage(step):
             whole = self.datamanager.views("train", original=True)
             views = [*whole, *self.datamanager.close_up_views()]
-            with progress_bar("Reading masks", passing=True) as progress:
-                masks = LabelMaps(view.labels for view in counted(views, len(views), progress))
+            masks = _labels(views)
             fit = residuals(model, whole, masks[: len(whole)]) if self.datamanager.config.photos == "all" else None
             with released(self.trainer.train_lock):  # For minutes the scene is only read, so a viewer may render it.
                 prepared = prepare(
@@ -238,9 +238,7 @@ class RefinementSwitch:
         self.model.prepared = self.prepared = self.ready = True
 
     def _join_base(self) -> None:
-        views = self.datamanager.views("train")
-        with progress_bar("Reading masks", passing=True) as progress:
-            scene = self._scene(LabelMaps(view.labels for view in counted(views, len(views), progress)))
+        scene = self._scene(_labels(self.datamanager.views("train")))
         if not bool(self.model.assigned):  # A resumed run has its classes already.
             self.model.take_members(Membership(self.refiner.seed_classes(scene)))
         self._own_training(scene)
@@ -299,6 +297,11 @@ class RefinementSwitch:
         self._start(grid, labels)
         self.trainer.seconds.refining()
         say(f"  refinement continues from {folder}")
+
+
+def _labels(views: Sequence[View]) -> LabelMaps:
+    with progress_bar("Reading masks", passing=True) as progress:
+        return LabelMaps(view.labels for view in counted(views, len(views), progress))
 
 
 @contextmanager

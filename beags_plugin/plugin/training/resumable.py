@@ -36,7 +36,7 @@ class Resumable(Protocol):
 
 
 class TrainingRun(Protocol):
-    """The trainer as the parts of a training see it.
+    """The trainer as the parts of a training see it; ``BeagsTrainer`` describes the methods.
 
     base_dir: folder of the run. loaded_run: folder of the run that this one resumes. last_step: number of steps of the
     run. seconds: of its stages. optimizers: of the scene. train_lock: nerfstudio's, held during a step, so that the
@@ -53,25 +53,15 @@ class TrainingRun(Protocol):
     @property
     def loaded_run(self) -> Path | None: ...
 
-    def reschedule(self, schedule: PhaseSchedule) -> None:
-        """Set the steps of this run, which some refiners compute from the data."""
-        ...
+    def reschedule(self, schedule: PhaseSchedule) -> None: ...
 
-    def keep(self, name: str, part: Resumable) -> None:
-        """Let checkpoints hold the state of ``part``."""
-        ...
+    def keep(self, name: str, part: Resumable) -> None: ...
 
-    def stop_if_asked(self, step: int) -> None:
-        """End the training before ``step`` after a signal, or if memory is running out."""
-        ...
+    def stop_if_requested(self, step: int) -> None: ...
 
-    def long_stage(self, step: int) -> AbstractContextManager[None]:
-        """Enclose a long stage after ``step``, which a signal ends at once."""
-        ...
+    def long_stage(self, step: int) -> AbstractContextManager[None]: ...
 
-    def eval_iteration(self, step: int) -> None:
-        """Evaluate as nerfstudio does after ``step``."""
-        ...
+    def eval_iteration(self, step: int) -> None: ...
 
 
 class GlobalRandom:

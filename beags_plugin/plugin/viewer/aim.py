@@ -22,9 +22,9 @@ WORLD = 10.0  # Viser's units in one of nerfstudio's: VISER_NERFSTUDIO_SCALE_RAT
 _MARGIN = 1.1  # Gaussians reach beyond the box of their centres.
 
 
-def frame_of(surfels: Surfels, members: Membership, wanted: Sequence[int], cameras: Sequence[Camera]) -> OrbitFrame:
-    """Return the frame of the box around the Gaussians of the ``wanted`` classes; each must have some."""
-    boxes = [bounding_box(surfels[members.of(class_id)]) for class_id in wanted]
+def frame_of(surfels: Surfels, members: Membership, class_ids: Sequence[int], cameras: Sequence[Camera]) -> OrbitFrame:
+    """Return the frame of the box around the Gaussians of these classes; each must have some."""
+    boxes = [bounding_box(surfels[members.of(class_id)]) for class_id in class_ids]
     low, high = torch.stack([box[0] for box in boxes]), torch.stack([box[1] for box in boxes])
     return orbit_frame(low.amin(dim=0), high.amax(dim=0), cameras)
 

@@ -93,7 +93,7 @@ class Visible:
 
 
 @torch.no_grad()
-def shown(
+def visible_part(
     surfels: Surfels, members: Membership, choice: Choice, rest: bool = True, inside: Tensor | None = None
 ) -> Visible:
     """Return the part of a scene that ``choice`` leaves.

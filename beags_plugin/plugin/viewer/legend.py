@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from beags_plugin.labels.colors import colorize
+from beags_plugin.plugin.training.scene_model import SceneModel
+from beags_plugin.system.pasted import command, quoted
+
+if TYPE_CHECKING:
+    from viser import GuiApi
 
 WORDS_APART = '{" "}'  # It stands between the words of a command.
 _LONGEST = 40  # Characters of a name that fit into the panel's width.
+_NERFSTUDIO = re.compile(r"(?P<before>.*)\n```\n(?P<command>ns-[^\n]*)\n```\s*", re.DOTALL)
+_PATHS = ("--load-config", "--camera-path-filename", "--output-path", "--output-dir")
 
 
 @dataclass(frozen=True)
@@ -45,11 +54,11 @@ def wrapped(text: str) -> str:
     return f'<div style={{{{overflowWrap: "anywhere"}}}}>{_literal(text)}</div>'
 
 
-def pasteable(command: str) -> str:
+def pasteable(line: str) -> str:
     """Return a command to copy: one click selects all of it. No line breaks after the hyphen of an option."""
     style = '{{whiteSpace: "pre-wrap", overflowWrap: "anywhere", userSelect: "all", fontSize: "0.8em"}}'
     whole = '{{display: "inline-block", maxWidth: "100%"}}'
-    words = [f"<span style={whole}>{_literal(word)}</span>" if word else "" for word in command.split(" ")]
+    words = [f"<span style={whole}>{_literal(word)}</span>" if word else "" for word in line.split(" ")]
     return f"<pre style={style}>{WORDS_APART.join(words)}</pre>"
 
 
@@ -97,3 +106,59 @@ def unique_labels(classes: Mapping[int, str]) -> dict[str, int]:
             label += "'"
         labels[label] = class_id
     return labels
+
+
+class Listed:
+    """The classes that a viewer lists: those that have Gaussians, under their present names.
+
+    labels: unique label to class id, ascending. counts: class id to number of Gaussians.
+    """
+
+    def __init__(self) -> None:
+        self.labels: dict[str, int] = {}
+        self.counts: dict[int, int] = {}
+        self._key: tuple | None = None
+
+    def refresh(self, model: SceneModel) -> bool:
+        """Update the list if the model's classes have changed; return whether they have."""
+        ids = model.class_ids
+        assigned, names = bool(model.assigned), tuple(model.classes.items())
+        key = (assigned, ids.data_ptr(), len(ids), ids._version, id(model.objects), names)
+        if key == self._key:
+            return False
+        members = model.members()
+        self.counts = {c: int(members.of(c).sum()) for c in members.present()} if assigned else {}
+        self.labels = unique_labels({class_id: model.classes.get(class_id, "") for class_id in self.counts})
+        self._key = key
+        return True
+
+
+def show_to_paste(gui: GuiApi) -> None:
+    """Let a page show nerfstudio's commands as ``to_paste`` writes them. gui: the page's own."""
+    add_markdown = gui.add_markdown
+
+    def show(content: str, *arguments: Any, **options: Any) -> Any:
+        return add_markdown(to_paste(content), *arguments, **options)
+
+    gui.add_markdown = show  # type: ignore[method-assign]
+
+
+def to_paste(text: str) -> str:
+    """Return Markdown that shows all of a nerfstudio command, with quoted paths; other texts stay as they are.
+
+    For a camera path ``beags render``, which needs no ffmpeg, comes first.
+    """
+    if (match := _NERFSTUDIO.fullmatch(text)) is None:
+        return text
+    program, *options = re.split(r" (?=--)", match["command"].strip())
+    values = {name: value for name, _, value in (option.partition(" ") for option in options)}
+    theirs = " ".join([program, *(_option(*each) for each in values.items())])
+    if program != "ns-render camera-path":
+        return f"{match['before']}\n\n{pasteable(theirs)}"
+    words = ["--load-config", values["--load-config"], "--camera-path", values["--camera-path-filename"]]
+    ours = command(["beags", "render", *words])
+    return f"{match['before']}\n\n{pasteable(ours)}\n\nor, where ffmpeg is installed,\n\n{pasteable(theirs)}"
+
+
+def _option(name: str, value: str) -> str:
+    return f"{name} {quoted(value) if name in _PATHS else value}".strip()

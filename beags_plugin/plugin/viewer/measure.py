@@ -38,7 +38,7 @@ def place_under(viewing: Viewing, position: Sequence[float], page: Camera) -> Pl
     direction, model = along(position, page), viewing.model
     view = camera_along(page.center.tolist(), direction.tolist(), focal=float(page.K[1, 1]))
     with viewing.held_soon():
-        surfels = viewing.shown().surfels
+        surfels = viewing.visible().surfels
         render = model.rasterizer.rasterize(
             geometry_inputs(surfels), view.to(surfels.means.device), model.settings(), surfels.means.new_zeros(3)
         )

@@ -23,8 +23,7 @@ from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.plugin.viewer.aim import frame_of, look, look_as, side_of_photos
 from beags_plugin.plugin.viewer.clicks import SceneClicks
 from beags_plugin.plugin.viewer.export import ShownFiles
-from beags_plugin.plugin.viewer.legend import LegendRow, capitalised, escaped, legend
-from beags_plugin.plugin.viewer.listed import Listed
+from beags_plugin.plugin.viewer.legend import LegendRow, Listed, capitalised, escaped, legend, show_to_paste
 from beags_plugin.plugin.viewer.pick_tab import PickTab
 from beags_plugin.plugin.viewer.pick_work import take_picked
 from beags_plugin.plugin.viewer.picking import under_cursor
@@ -38,10 +37,9 @@ from beags_plugin.plugin.viewer.serving import (
     show_text,
 )
 from beags_plugin.plugin.viewer.size_tab import SizeTab
-from beags_plugin.plugin.viewer.to_paste import show_to_paste
 from beags_plugin.plugin.viewer.viewed_run import ViewedRun
 from beags_plugin.plugin.viewer.viewing import NO_CLASSES, Viewing
-from beags_plugin.plugin.viewer.window import Windows, shown_finished
+from beags_plugin.plugin.viewer.window import Windows, set_up_finished
 from beags_plugin.system.errors import UserError
 
 if TYPE_CHECKING:
@@ -126,7 +124,7 @@ class ObjectPanel(ViewerElement[None]):
         if viewer.trainer is None and (damaged := take_picked(self.viewing.model, run.folder)):
             self.note("picked", damaged)
         self.viewing.attach(run, viewer.trainer is not None, viewer.train_lock)
-        self.viewing.wanted, self.viewing.crop_box = self._wanted, self._crop_box
+        self.viewing.requested, self.viewing.crop_box = self._requested, self._crop_box
         if self._server is not None:
             self.clicks = clicks = SceneClicks(self._server)
             if viewer.trainer is None:  # Training renumbers the Gaussians.
@@ -134,7 +132,7 @@ class ObjectPanel(ViewerElement[None]):
             self.size_tab = SizeTab(self._server, self.viewing, clicks)
             hide_training_cameras(viewer, lambda index: self._hit_camera(run.names[index]))
             if viewer.trainer is None:
-                self._windows = shown_finished(viewer)
+                self._windows = set_up_finished(viewer)
         if run.note is not None:
             self.note("run", run.note)
         offer_whole_pictures(viewer.control_panel)
@@ -145,16 +143,16 @@ class ObjectPanel(ViewerElement[None]):
             end_when_interrupted(viewer.viser_server)
         threading.Thread(target=self._follow, name="beags panel", daemon=True).start()
 
-    def listen(self, wanted: bool) -> None:
+    def listen(self, listening: bool) -> None:
         """Start or stop waiting for the click that picks; only one, because the page's camera is fixed meanwhile."""
-        if self._link is None or wanted == self._listening:
+        if self._link is None or listening == self._listening:
             return
-        self._listening = wanted
-        if wanted:
+        self._listening = listening
+        if listening:
             self._link.register_pointer_cb("click", self.clicked)
         else:
             self._link.unregister_pointer_cb()
-        self.note("object", "Click an object in the picture; press again to cancel." if wanted else "")
+        self.note("object", "Click an object in the picture; press again to cancel." if listening else "")
 
     def _joined(self, client: ClientHandle) -> None:
         """Set up a new page: the pace of its pictures, and a first camera at the objects."""
@@ -167,16 +165,16 @@ class ObjectPanel(ViewerElement[None]):
     def centre(self, client: ClientHandle | None, first: bool = False) -> None:
         """Turn a page's camera to the chosen object; first: to all objects, from the side of the photos."""
         run, chosen = self.viewing.run, self.labels.get(self.object.value)
-        wanted = [class_id for class_id in self.labels.values() if (class_id if first else class_id == chosen)]
-        if not wanted and not first:
+        class_ids = [class_id for class_id in self.labels.values() if (class_id if first else class_id == chosen)]
+        if not class_ids and not first:
             self.note("object", f"Nothing to centre on: {NO_CLASSES}")
         if client is None or run is None:
             return
-        if not wanted:
+        if not class_ids:
             if first and self.pick_tab is not None:  # There are no objects yet.
                 look_as(client, run.cameras)
             return
-        frame = frame_of(*self.viewing.whole(), wanted, run.cameras)
+        frame = frame_of(*self.viewing.whole(), class_ids, run.cameras)
         look(client, frame, side_of_photos(frame, run.cameras) if first else None)
 
     def _hit_camera(self, name: str) -> None:
@@ -243,13 +241,13 @@ class ObjectPanel(ViewerElement[None]):
         self.refresh_objects()
         self._write_texts()
         run = self.viewing.run
-        if run is not None and "occupancy_violation" in self._wanted():
+        if run is not None and "occupancy_violation" in self._requested():
             if self.viewing.model.grid is None:
                 run.load_grid()
             if self.viewing.refresh_shares():
                 self._redraw()
 
-    def _wanted(self) -> frozenset[str]:
+    def _requested(self) -> frozenset[str]:
         if self.viewer is None:
             return frozenset()
         controls = self.viewer.control_panel

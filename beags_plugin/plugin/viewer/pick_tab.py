@@ -100,14 +100,14 @@ class PickTab:
         if self._boxing:
             return
         inside, position, camera = not self.excludes.value, event.screen_pos, page_camera(event.client.camera)
-        self._mark(lambda _: click_mark(position, camera, inside, self.work.drawn()))
+        self._mark(lambda _: click_mark(position, camera, inside, self.work.rendered()))
 
-    def take_box(self, wanted: bool) -> None:
+    def take_box(self, waiting: bool) -> None:
         """Start or stop waiting for a box; the page's camera is fixed meanwhile."""
-        if wanted == self._boxing:
+        if waiting == self._boxing:
             return
-        self._boxing = wanted
-        if wanted:
+        self._boxing = waiting
+        if waiting:
             self.server.scene.on_pointer_event("rect-select")(self.boxed)
             self.report("Drag a box over the picture; press again to cancel.")
         else:
@@ -120,7 +120,7 @@ class PickTab:
         inside, corners, camera = not self.excludes.value, event.screen_pos, page_camera(event.client.camera)
 
         def mark(pointed: bool) -> ViewMarks:
-            return box_mark(corners, camera, inside, self.work.drawn(), inside and not pointed)
+            return box_mark(corners, camera, inside, self.work.rendered(), inside and not pointed)
 
         self._mark(mark)
 

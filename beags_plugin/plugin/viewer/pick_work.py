@@ -162,9 +162,9 @@ class PickWork:
 
     # -- reading -----------------------------------------------------------------------------------------------------
 
-    def drawn(self) -> Tensor | None:
+    def rendered(self) -> Tensor | None:
         """Return [N] bool, the Gaussians that the viewer renders; None: all."""
-        index = self._viewing.shown().index
+        index = self._viewing.visible().index
         if index is None:
             return None
         rendered = torch.zeros(self._viewing.model.num_points, dtype=torch.bool)

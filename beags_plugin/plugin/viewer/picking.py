@@ -79,7 +79,7 @@ def under_cursor(viewing: Viewing, origin: Sequence[float], direction: Sequence[
     busy."""
     model = viewing.model
     with viewing.held_soon():
-        scene = viewing.shown()
+        scene = viewing.visible()
         rank = pick(model.rasterizer, scene.surfels, model.settings(), origin, direction)
         if rank is None:
             raise UserError("nothing is shown there.")

@@ -17,7 +17,7 @@ from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.occupancy.violation import violation_shares
 from beags_plugin.plugin.training.scene_model import SceneModel
-from beags_plugin.plugin.viewer.choice import Choice, Visible, shown
+from beags_plugin.plugin.viewer.choice import Choice, Visible, visible_part
 from beags_plugin.plugin.viewer.pace import Pace
 from beags_plugin.plugin.viewer.pictures import (
     boundary_picture,
@@ -50,7 +50,7 @@ PATIENCE = 5.0  # Seconds that a click waits for the scene.
 NO_CLASSES = "the Gaussians have no classes yet: they get them between base training and refinement."
 
 
-def asked_by_viewer() -> bool:
+def called_by_viewer() -> bool:
     """Return whether nerfstudio's viewer calls; evaluation and ns-render get the whole scene."""
     return isinstance(threading.current_thread(), RenderStateMachine)
 
@@ -61,7 +61,7 @@ def scene_outputs(model: SceneModel, camera: Camera) -> dict[str, Tensor]:
     Each [H, W, 1 or 3] float32: rgb, depth (world units along z), normal, accumulation, background; with classes also
     class_map (colours) and class_confidence (the winner's share).
     """
-    scene = shown(model.surfels(), model.members(), Choice(), inside=within(model, model.crop_box))
+    scene = visible_part(model.surfels(), model.members(), Choice(), inside=within(model, model.crop_box))
     outputs = plain_outputs(model, scene, camera, model.background_color)
     if bool(model.assigned):
         outputs.update(class_outputs(model, scene, camera))
@@ -133,8 +133,8 @@ class Viewing:
     good. So a rendering stores its results by one assignment, and a failure becomes a note.
 
     background: [3], the viewer's. listed: names of ``CHANNELS`` that this run offers, fixed as long as a viewer runs.
-    wanted: returns those that are visible now. crop_box: returns the viewer's. run: the run's files. notes: remarks on
-    the pictures of the last rendering. pace: of the rendering. paint: of the picked objects. errand: objects to pick
+    requested: returns those that are visible now. crop_box: returns the viewer's. run: the run's files. notes: remarks
+    on the pictures of the last rendering. pace: of the rendering. paint: of the picked objects. errand: objects to pick
     for a waiting program.
     """
 
@@ -143,7 +143,7 @@ class Viewing:
         self.choice = Choice()
         self.background: Tensor | None = None
         self.listed: tuple[str, ...] = ()
-        self.wanted: Callable[[], frozenset[str]] = frozenset
+        self.requested: Callable[[], frozenset[str]] = frozenset
         self.crop_box: Callable[[], OrientedBox | None] = lambda: None
         self.run: ViewedRun | None = None
         self.shares: Shares | None = None
@@ -185,35 +185,35 @@ class Viewing:
         finally:
             self.lock.release()
 
-    def shown(self, rest: bool = True) -> Visible:
+    def visible(self, rest: bool = True) -> Visible:
         """Return the Gaussians to render by choice and paint; rest: False leaves the faded ones out."""
         model = self.model
         choice = self.choice if bool(model.assigned) else Choice(min_opacity=self.choice.min_opacity)
         inside, paint = within(model, self.crop_box()), self.paint
         if paint is not None and paint.only is not None:
             inside = paint.only if inside is None else inside & paint.only
-        return shown(model.surfels().detach(), model.members(), choice, rest, inside)
+        return visible_part(model.surfels().detach(), model.members(), choice, rest, inside)
 
     def outputs(self, camera: Camera) -> dict[str, Tensor]:
         """Render every picture that the viewer lists; those that are not visible at present stay black."""
         model, notes = self.model, {}
         started, worked = time.perf_counter(), time.process_time()
-        wanted = self.wanted() & frozenset(self.listed)
-        scene = self.shown()
+        requested = self.requested() & frozenset(self.listed)
+        scene = self.visible()
         background = model.background_color if self.background is None else self.background
         outputs = plain_outputs(model, scene, camera, background, self.paint)
         del outputs["background"]
         black = camera.K.new_zeros(1, 1, 1)
         for name in self.listed:
             outputs[name] = black.expand(camera.height, camera.width, CHANNELS[name])
-        if wanted & {"class_map", "class_confidence"}:
+        if requested & {"class_map", "class_confidence"}:
             if bool(model.assigned):
                 outputs.update(class_outputs(model, scene, camera))
             else:
                 notes["classes"] = f"No class map: {NO_CLASSES}"
-        if "occupancy_violation" in wanted:
+        if "occupancy_violation" in requested:
             outputs.update(self._violation(scene, camera, notes))
-        if names := wanted & OF_TRAINING_VIEWS:
+        if names := requested & OF_TRAINING_VIEWS:
             outputs.update(self._of_training_view(names, scene, camera, notes))
         self.notes = notes
         spent = time.perf_counter() - started, time.process_time() - worked
@@ -264,9 +264,9 @@ class Viewing:
         return outputs
 
     def copy(self, rest: bool = True) -> Visible:
-        """Return a copy of ``shown``; waits for the training step, if there is one."""
+        """Return a copy of ``visible``; waits for the training step, if there is one."""
         with self.lock:
-            scene = self.shown(rest)
+            scene = self.visible(rest)
             return Visible(scene.surfels.clone(), scene.class_ids.clone(), scene.index)
 
     def whole(self) -> tuple[Surfels, Membership]:

@@ -74,7 +74,7 @@ class Windows:
         return max(height, 1), max(round(height * aspect), 1)
 
 
-def shown_finished(viewer: Viewer) -> Windows:
+def set_up_finished(viewer: Viewer) -> Windows:
     """Hide nerfstudio's controls of training and a logo that it loads from the web; return the pages' sizes."""
     viewer.pause_train.visible = viewer.resume_train.visible = False
     for control in (viewer.control_panel._train_speed, viewer.control_panel._train_util):

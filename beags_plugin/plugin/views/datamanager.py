@@ -98,9 +98,9 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
 
     def _add_dense_seeds(self) -> None:
         """Add seed points on which photos agree, if the option says so and there are points to begin with."""
-        seeds, wanted = self.train_dataparser_outputs.metadata, self.config.dense_seeds
+        seeds, option = self.train_dataparser_outputs.metadata, self.config.dense_seeds
         few = len(self.train_dataset) <= MOST_PHOTOS and self.config.photos == "all"
-        if self.config.begins and not seeds["points3D_random"] and (wanted == "on" or (wanted == "auto" and few)):
+        if self.config.begins and not seeds["points3D_random"] and (option == "on" or (option == "auto" and few)):
             seeds["points3D_xyz"], seeds["points3D_rgb"] = with_dense_seeds(
                 self.views("train"), seeds["points3D_xyz"], seeds["points3D_rgb"]
             )

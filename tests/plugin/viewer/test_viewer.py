@@ -275,7 +275,7 @@ def test_odd_names_and_classes_that_come_later(window):
     for name in CHANNELS:
         assert window.look(name)["rgb"].isfinite().all()
     assert "no classes yet" in window.model.viewing.notes.get("classes", "no classes yet")
-    assert len(model.viewing.shown().surfels) == model.num_points
+    assert len(model.viewing.visible().surfels) == model.num_points
     assert panel.files.write().exists()
     model.assigned.fill_(True)
     model.set_extra_state(classes)
