@@ -97,7 +97,7 @@ def test_a_preset_takes_the_overrides_of_the_one_it_is_like(tmp_path):
     assert (spec.config.pipeline.model.base_steps, spec.config.pipeline.model.refine_steps) == (7, 9)
     assert [path.stem for path in preset_files("third", tmp_path)] == ["third", "second", "first"]
     (tmp_path / "first.toml").write_text("description='x'\nlike='third'")
-    with pytest.raises(UserError, match="is like itself by way of .*first.toml: take a like away"):
+    with pytest.raises(UserError, match="is like itself through .*first.toml: remove one entry like"):
         load_preset("third", tmp_path)
 
 
