@@ -33,10 +33,6 @@ class Certainty:
     lines: list[str]
     figures: dict[str, Any] = field(default_factory=dict)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return plain values for summary.json."""
-        return {"level": self.level, "sentences": self.lines, **self.figures}
-
 
 def certainty(
     run: Path, scene: Path, masks: Path | None = None, again: str = "beags demo --pick", apart: Path | None = None

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -25,7 +23,7 @@ from beags_plugin.commands.demo_training import STARTED, read_stamp, train_once
 from beags_plugin.system.digests import code_digest, value_digest
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.pasted import command, quoted
-from beags_plugin.system.progress import progress_bar
+from beags_plugin.system.progress import progress_bar, timed
 from beags_plugin.system.whole_files import write_text_atomically
 
 if TYPE_CHECKING:
@@ -242,7 +240,8 @@ def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene
     memory = training["peak_memory_mb"]
     apart = scene.labels if scene.labels == output / APART else None
     sure = certainty(run, scene.data, scene.made_masks, again, apart)
-    summary = {**summary_json(metrics, stages, memory), "certainty": sure.to_json()}
+    judged = {"level": sure.level, "sentences": sure.lines, **sure.figures}
+    summary = {**summary_json(metrics, stages, memory), "certainty": judged}
     write_text_atomically(json.dumps(summary, indent=2), output / "summary.json")
     doubt = write_doubt(run, output / "doubt.png", apart)
     CONSOLE.print(render_run(metrics, stages, memory))
@@ -268,11 +267,3 @@ def _alone(run: EvaluatedRun, written: Sequence[Extracted]) -> dict[int, dict[st
         if len(scene.members):
             stages[int(scene.members.class_ids[0])]["after"] = scene.surfels()
     return stages
-
-
-@contextmanager
-def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
-    """Measure the wall time of the block into ``seconds[name]``."""
-    start = time.perf_counter()
-    yield
-    seconds[name] = time.perf_counter() - start

@@ -264,7 +264,7 @@ class BeagsTrainer(Trainer):
             self.training_state = "training"
 
     def stop_if_requested(self, step: int) -> None:
-        """Save the step before ``step`` and end, if a signal asked for that or memory is running out."""
+        """Save the step before ``step`` and end, after a signal or if memory is running out."""
         if self._interrupts.asked is not None:
             if step > self._start_step:
                 self._save_once(step - 1)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -36,6 +36,7 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import check_surface_depth
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.filed_tensors import filed
+from beags_plugin.system.progress import timed
 
 LEAST_K = 10  # Fewer neighbours would measure the noise of the depth rather than the distance of points.
 
@@ -138,12 +139,12 @@ def prepare(
 
     agreement = None
     if config.agree:
-        with _timed("agreement", seconds):
+        with timed(seconds, "agreement"):
             maps, agreement = agree(surfels, cameras, maps, known, rasterizer, settings, stage)
         summary.append(f"agreement: {agreement.sentence()}")
-    with _timed("reprojection", seconds):
+    with timed(seconds, "reprojection"):
         masks = _consistent_masks(surfels, cameras, maps, known, rasterizer, settings, config, stage, summary)
-    with _timed("assignment", seconds), stage("Assigning classes") as progress:
+    with timed(seconds, "assignment"), stage("Assigning classes") as progress:
         shares = contributions(surfels, cameras, masks.ranked, rasterizer, settings, len(known), progress=progress)
         shares = replace(shares, classes=known)
         assignment = by_largest(shares)
@@ -192,13 +193,6 @@ def check_masks(labels: Iterable[Tensor | None]) -> None:
         f"{fault}: put id images into masks/<image name>.png, make them with beags masks make, or train the preset "
         "beags-base, which needs none."
     )
-
-
-@contextmanager
-def _timed(name: str, seconds: dict[str, float]) -> Iterator[None]:
-    start = time.perf_counter()
-    yield
-    seconds[name] = time.perf_counter() - start
 
 
 def _consistent_masks(

@@ -1,4 +1,4 @@
-"""What was picked and corrected in the viewer, beside a run's checkpoint: other classes for the same Gaussians."""
+"""The file of classes that were picked in the viewer, beside a run's checkpoint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A finished run as one object: opened once and passed down, each part read when it is first asked for."""
+"""A finished run as one object: opened once and passed down, each part read at its first use."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from time import monotonic
+from time import monotonic, perf_counter
 from typing import TypeVar
 
 from rich import get_console
@@ -51,6 +51,14 @@ def progress_bar(name: str, passing: bool = False) -> Iterator[Callable[[int, in
             progress.live.stop()  # progress.stop() would print a blank line where output is no terminal
         else:
             progress.stop()
+
+
+@contextmanager
+def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Measure the wall time of the block into ``seconds[name]``."""
+    start = perf_counter()
+    yield
+    seconds[name] = perf_counter() - start
 
 
 def say(message: str, warning: bool = False) -> None:

@@ -50,13 +50,13 @@ class RefinementSwitch:
         model.prepared = False
 
     @property
-    def wanted(self) -> bool:
+    def refines(self) -> bool:
         """Return whether this run refines at all."""
         return self.model.schedule.refine_steps > 0
 
     def ask_steps(self) -> None:
         """Set the number of refinement steps, which the refiner may compute from the data."""
-        if not self.wanted:
+        if not self.refines:
             return
         self.refiner.check(self.model.classes)
         schedule, views = self.model.schedule, len(self.datamanager.train_dataset)
@@ -103,7 +103,7 @@ class RefinementSwitch:
         model = self.model
         if self.refiner.joins_base and model.own_training is None:
             self._join_base()
-        if not self.wanted or not model.schedule.refining(step):
+        if not self.refines or not model.schedule.refining(step):
             return
         if not self.ready:
             if self.prepared or int(model.refined_steps) > 0:
@@ -135,7 +135,7 @@ class RefinementSwitch:
                 )
         if self._closes_after(step):
             self._close_contacts()
-        if self.wanted and not self.ready and step + 1 == self.model.schedule.base_steps:
+        if self.refines and not self.ready and step + 1 == self.model.schedule.base_steps:
             self._switching = True
             self._prepare(step)
             self._switching = False
@@ -178,7 +178,7 @@ class RefinementSwitch:
             )
 
     def _prepare(self, step: int) -> None:
-        """Prepare refinement from the scene as it is and the masks of the data. step: the last one done."""
+        """Prepare refinement from the present scene and the masks of the data. step: the last one done."""
         model = self.model
         say("Preparing refinement")
         start = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Write what a viewer shows into files, while the viewer goes on."""
+"""Write what a viewer shows into files, in a thread of its own."""
 
 from __future__ import annotations
 
