@@ -132,21 +132,21 @@ def photo_gains(datamanager: BeagsDataManager) -> Gains | None:
     places, light = [], []
     with progress_bar("Comparing exposures", passing=True) as progress:
         for index, view in enumerate(counted(datamanager.views("train"), len(tracks), progress)):
-            held = view.data()
-            image = in_unit_range(held["image"]).cpu()
+            data = view.data()
+            image = in_unit_range(data["image"]).cpu()
             ids, shares = tracks[index]
             xy = datamanager.files["train"].straightened(shares, index)[1]
             inside = ((xy >= 0) & (xy < image.shape[1::-1])).all(axis=1)  # An undistorted photo shows less.
-            inside[inside] = _used(view, held, datamanager)[tuple(xy[inside].astype(np.int64).T[::-1])]
+            inside[inside] = _used(view, data, datamanager)[tuple(xy[inside].astype(np.int64).T[::-1])]
             places.append(np.where(inside, ids, -1))
             light.append(linear_from_srgb(interpolated(image, xy)))
     return gains(sightings(places, light), len(tracks))
 
 
-def _used(view: View, held: dict[str, Tensor], datamanager: BeagsDataManager) -> np.ndarray:
-    """Return [H, W] bool, the pixels of a photo, whose data are ``held``, that training uses."""
+def _used(view: View, data: dict[str, Tensor], datamanager: BeagsDataManager) -> np.ndarray:
+    """Return [H, W] bool, the pixels of a photo, whose data are ``data``, that training uses."""
     used = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool)
-    if (alpha := held.get("alpha")) is not None:
+    if (alpha := data.get("alpha")) is not None:
         used &= alpha.cpu() >= OPAQUE
     if datamanager.config.photos == "objects" and (labels := view.labels) is not None:
         used &= ((labels != BACKGROUND) & (labels != IGNORE)).cpu()

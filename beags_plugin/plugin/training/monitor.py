@@ -81,8 +81,8 @@ class Curves:
             self._boundaries(step)
         done = step + 1
         due = self.every > 0 and (not self._measured or done % self.every == 0 or done == self.last)
-        final = model.own_training is None or done == self.last  # Refiners with own steps have objects only at the end.
-        if due and final and model.schedule.refining(done) and bool(model.assigned):
+        has_objects = model.own_training is None or done == self.last  # Such a refiner has none before.
+        if due and has_objects and model.schedule.refining(done) and bool(model.assigned):
             self._objects(step)
 
     def _named(self, values: dict[int, float]) -> dict[str, float]:
