@@ -144,7 +144,7 @@ def photo_gains(datamanager: BeagsDataManager) -> Gains | None:
 
 
 def _used(view: View, data: dict[str, Tensor], datamanager: BeagsDataManager) -> np.ndarray:
-    """Return [H, W] bool, the pixels of a photo, whose data are ``data``, that training uses."""
+    """Return [H, W] bool, the pixels of a photo that training uses. data: the view's."""
     used = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool)
     if (alpha := data.get("alpha")) is not None:
         used &= alpha.cpu() >= OPAQUE
