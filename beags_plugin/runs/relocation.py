@@ -13,10 +13,11 @@ from beags_plugin.system.progress import say
 _announced: set[Path] = set()  # Folders of moved runs that a line has named.
 
 
-class Placed(Protocol):
-    """A config that knows where its run and its data lie: ``RunConfig``, or nerfstudio's."""
+class AnyConfig(Protocol):
+    """The config of a run: ``RunConfig``, or ``BeagsTrainerConfig`` for nerfstudio."""
 
     run_dir: Path | None
+    relative_model_dir: Path
 
     @property
     def data_config(self) -> Any: ...
@@ -25,6 +26,8 @@ class Placed(Protocol):
     def data_path(self) -> Path: ...
 
     def get_base_dir(self) -> Path: ...
+
+    def text_in(self, folder: Path) -> str: ...
 
 
 def open_run(config_path: Path, data: Path | None = None) -> RunConfig:
@@ -46,7 +49,7 @@ def check_data(data: Path, config_path: Path) -> None:
         )
 
 
-def relocate(config: Placed, config_path: Path, data: Path | None) -> None:
+def relocate(config: AnyConfig, config_path: Path, data: Path | None) -> None:
     """Set the folder of a run to that of its config.yml, and its data to where they lie now."""
     folder, trained_in, recorded = config_path.absolute().parent, config.get_base_dir(), config.data_path
     config.run_dir = folder

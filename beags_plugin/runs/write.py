@@ -4,24 +4,15 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from beags_plugin.options.run_format import CONFIG_FILE
 from beags_plugin.runs.layout import TRANSFORM_FILE
+from beags_plugin.runs.relocation import AnyConfig
 from beags_plugin.system.whole_files import write_text_atomically, write_whole
-
-
-class Copied(Protocol):
-    """A config from which other runs' configs are made: ``RunConfig``, or nerfstudio's."""
-
-    relative_model_dir: Path
-
-    def get_base_dir(self) -> Path: ...
-
-    def text_in(self, folder: Path) -> str: ...
 
 
 def save_atomically(content: Any, path: Path) -> None:
@@ -30,7 +21,7 @@ def save_atomically(content: Any, path: Path) -> None:
     write_whole(path, lambda file: torch.save(content, file), path.parent.parent)
 
 
-def write_run(config: Copied, folder: Path, model_state: dict[str, Tensor], step: int) -> Path:
+def write_run(config: AnyConfig, folder: Path, model_state: dict[str, Tensor], step: int) -> Path:
     """Write a run that holds ``model_state`` of a ``BeagsModel``; returns the path of its config.yml.
 
     config: of the run from which it is made. step: of the checkpoint.

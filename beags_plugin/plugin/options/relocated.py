@@ -6,22 +6,14 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 from beags_plugin.runs.layout import newest_checkpoint
-from beags_plugin.runs.relocation import Placed, check_data, relocate
+from beags_plugin.runs.relocation import check_data, relocate
 from beags_plugin.system.errors import print_user_errors_plainly
 from beags_plugin.system.program import path_option, program_name
 
 _named: list[Path] = []  # Files config.yml named by ``named``.
-
-
-class OpenedConfig(Placed, Protocol):
-    """A config as nerfstudio's programs read it."""
-
-    overwrite: bool
-
-    def get_checkpoint_dir(self) -> Path: ...
 
 
 @contextmanager
@@ -38,8 +30,11 @@ def named(config_path: Path) -> Iterator[None]:
         _named.pop()
 
 
-def place_for_nerfstudio(config: OpenedConfig) -> None:
-    """Set the place of a run whose config an ns-* command reads from YAML to the folder of its --load-config."""
+def place_for_nerfstudio(config: Any) -> None:
+    """Set the place of a run whose config an ns-* command reads from YAML to the folder of its --load-config.
+
+    config: a ``BeagsTrainerConfig``.
+    """
     path = _named[-1] if _named else path_option("--load-config")
     if path is None:
         return
