@@ -77,9 +77,9 @@ def read_scene(config: RunConfig, config_path: Path) -> SavedScene:
     return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"], state is not trained)
 
 
-def read_run(config_path: Path, data: Path | None = None) -> SavedScene:
-    """Open a run and read only its scene; data: folder of its photos, if they were moved."""
-    return read_scene(open_run(config_path, data), config_path)
+def read_run(config_path: Path) -> SavedScene:
+    """Open a run and read only its scene."""
+    return read_scene(open_run(config_path), config_path)
 
 
 def read_transform(run: Path) -> tuple[Tensor, float] | None:

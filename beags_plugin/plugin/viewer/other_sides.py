@@ -51,7 +51,7 @@ def _sees(camera: Camera, center: Tensor) -> bool:
     return float(local[2]) > 0 and 0 <= column < camera.width and 0 <= row < camera.height
 
 
-def close_camera(camera: Camera, points: Tensor, pixels: int = _PIXELS) -> Camera | None:
+def close_camera(camera: Camera, points: Tensor) -> Camera | None:
     """Return a camera at the same place whose square picture shows ``points`` [P, 3]; None if it sees none."""
     local = points.double().cpu() @ camera.rotation.double().cpu().T + camera.translation.double().cpu()
     local = local[local[:, 2] > 0]
@@ -60,15 +60,15 @@ def close_camera(camera: Camera, points: Tensor, pixels: int = _PIXELS) -> Camer
     plane = local[:, :2] / local[:, 2:]
     low, high = plane.quantile(0.01, dim=0), plane.quantile(0.99, dim=0)
     half = max(_MARGIN * float((high - low).max()) / 2, 4.0 / float(camera.K[0, 0]))
-    focal, middle = pixels / (2 * half), (low + high) / 2
+    focal, middle = _PIXELS / (2 * half), (low + high) / 2
     K = torch.tensor(
         [
-            [focal, 0.0, pixels / 2 - focal * float(middle[0])],
-            [0.0, focal, pixels / 2 - focal * float(middle[1])],
+            [focal, 0.0, _PIXELS / 2 - focal * float(middle[0])],
+            [0.0, focal, _PIXELS / 2 - focal * float(middle[1])],
             [0.0, 0.0, 1.0],
         ]
     )
-    return Camera(camera.viewmat.cpu(), K, pixels, pixels)
+    return Camera(camera.viewmat.cpu(), K, _PIXELS, _PIXELS)
 
 
 @torch.no_grad()

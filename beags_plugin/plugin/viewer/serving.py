@@ -121,8 +121,8 @@ def repeat(step: Callable[[], None], seconds: float, failed: Callable[[str], Non
             failed(f"{type(error).__name__}: {error}")
 
 
-def end_rendering(viewer: object, seconds: float = 30.0) -> None:
-    """End the render threads of every page of a viewer, waiting at most ``seconds`` for each to finish its picture.
+def end_rendering(viewer: object) -> None:
+    """End the render threads of every page of a viewer, waiting at most 30 s for each to finish its picture.
 
     viewer: nerfstudio's, or None. A render thread inside the rasterizer would abort an interpreter that ends.
     """
@@ -134,7 +134,7 @@ def end_rendering(viewer: object, seconds: float = 30.0) -> None:
     for thread in threads:
         thread.running = False
     for thread in threads:
-        thread.join(seconds)
+        thread.join(30.0)
 
 
 def end_when_interrupted(server: ViserServer) -> None:
