@@ -185,5 +185,5 @@ def test_subcommands_read_alike():
     assert kinds["json"] == {"Path | None"} and kinds["object"] == {"tuple[str, ...]"}
     assert kinds["load_config"] == {"Path", "tuple[Path, ...]"}  # eval takes several
     assert kinds["output"] <= {"Annotated[Path, OUTPUT]", "Annotated[Path | None, OUTPUT]"}
-    assert kinds["objects"] == {"int"}  # of the demo: how many; names are given by object
+    assert kinds["objects"] == {"int"}  # The demo takes a number here; names are given by object.
     assert not {"run", "config", "config_path", "out", "out_dir"} & set(kinds)

@@ -172,7 +172,7 @@ def test_the_base_of_a_demo_without_picks_is_used_again_and_its_run_is_replaced_
     with pytest.raises(UserError, match=r"trained with --pick: add --fresh"):
         stand.run(pick=False)
     shutil.rmtree(stand.output / "pick")
-    assert stand.run(fresh=True)[0] == "base"  # that of the picked run is not taken for one without picks
+    assert stand.run(fresh=True)[0] == "base"  # The picked run's base is not reused.
 
 
 @pytest.mark.parametrize(

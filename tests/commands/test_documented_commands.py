@@ -120,7 +120,7 @@ def training_config(words: list[str]):
 def check_beags(words: list[str]) -> None:
     name = " ".join(words[:2]) if words[0] == "masks" else words[0]
     if name in RUN and "plane" not in words:  # the clouds of the test's run stand on nothing
-        sized = {"--camera-path", "--underlay"} & set(words)  # which have sizes of their own
+        sized = {"--camera-path", "--underlay"} & set(words)  # These have sizes of their own.
         cli.main([*words, *([] if sized else RUN[name])])
         return
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)

@@ -75,7 +75,7 @@ def test_what_surrounds_objects_changes_no_bit_and_a_killed_run_ends_alike(folde
         resume_to_end(run)
     resume_to_end(run)
     found = differences(*(without_clocks(checkpoint_of(each)) for each in (run, folders / "run")))
-    assert found and all(place.endswith("train_psnr") for place in found)  # of whole photos
+    assert found and all(place.endswith("train_psnr") for place in found)  # It is measured on whole photos.
 
 
 def test_black_objects_are_solid_and_nothing_else_is(folders):

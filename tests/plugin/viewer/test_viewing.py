@@ -198,7 +198,7 @@ def test_a_view_fits_into_any_picture_and_sees_the_same(width, height):
     fitted = fitted_camera(camera, width, height)
     assert 1 <= fitted.width <= width and 1 <= fitted.height <= height
     assert fitted.width == width or fitted.height == height
-    corner = torch.tensor([0.5 * 32, 0.25 * 24, 1.0])  # of the view; the same share of the fitted one
+    corner = torch.tensor([0.5 * 32, 0.25 * 24, 1.0])  # The corner has the same place in both views.
     ray = torch.linalg.inv(camera.K) @ corner
     there = fitted.K @ ray
     assert there.tolist() == pytest.approx([0.5 * fitted.width, 0.25 * fitted.height, 1.0], rel=1e-5)
