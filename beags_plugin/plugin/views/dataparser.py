@@ -20,8 +20,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
-from beags_plugin.plugin.views.ns_programs import prepare_reading
-from beags_plugin.plugin.views.ns_train import prepare
+from beags_plugin.plugin.views.ns_programs import prepare_reading, prepare_training
 from beags_plugin.system.errors import print_user_errors_plainly
 from beags_plugin.views.cameras import SceneCameras
 from beags_plugin.views.data_options import DataOptions
@@ -80,7 +79,7 @@ def __getattr__(name: str) -> DataParserSpecification:
     """Return ``beags_data``, the target of nerfstudio's entry point, after preparing the program that reads it."""
     if name != "beags_data":
         raise AttributeError(name)
-    prepare()
+    prepare_training()
     prepare_reading()
     return DataParserSpecification(
         config=BeagsDataParserConfig(),

@@ -1,4 +1,6 @@
-"""Prepare nerfstudio's programs for a run of ours, before they import nerfstudio's own methods.
+"""Prepare nerfstudio's programs for a method or a run of ours, before they import nerfstudio's own methods.
+
+Nerfstudio loads data parsers of other packages long before their methods, so our data parser calls this.
 
 One warning comes before any code of ours: of ``torch.jit.script`` in nerfstudio's cameras, which our data parser needs.
 """
@@ -8,10 +10,12 @@ from __future__ import annotations
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
-from beags_plugin.system.errors import silence_libraries
+from beags_plugin.system.errors import UserError, check_choice, meant, silence_libraries
 from beags_plugin.system.pasted import command
 from beags_plugin.system.program import path_option, program_name
+from beags_plugin.system.shipped import shipped_names
 
 PROGRAMS = ("ns-viewer", "ns-render", "ns-eval", "ns-export")
 _OF_OURS = b"!!python/object:beags_plugin."
@@ -56,3 +60,39 @@ def _cannot_render(mode: str, config_path: Path) -> str | None:
         words += ["--output", str(output)]
     path = "" if mode == "camera-path" else " and turns about the objects"
     return f"ns-render {mode} needs ffmpeg, which is not installed; this command needs none{path}: {command(words)}"
+
+
+def prepare_training() -> None:
+    """Make ns-train of a preset of ours quicker and quieter; exit with one sentence if the preset is misspelt.
+
+    Other programs, and ns-train with other methods, are left as they are.
+    """
+    words = sys.argv[1:]
+    name = words[0] if words else ""
+    presets = shipped_names("method_configs")
+    if program_name() != "ns-train" or not (name.startswith("beags") or meant(name, presets)):
+        return
+    try:
+        check_choice(name, presets, "preset")
+    except UserError as error:
+        print(f"beags: {error}", file=sys.stderr)
+        sys.exit(2)
+    silence_libraries()
+    _leave_out_other_methods()
+
+
+def _leave_out_other_methods() -> None:
+    """Skip nerfstudio's work at each start for methods other than the named one.
+
+    For every method that could be installed it walks over all modules of the process, and for one function of
+    splatfacto it imports torch's compiler.
+    """
+    from nerfstudio.configs import external_methods
+    from nerfstudio.utils import misc
+
+    external_methods.external_methods.clear()
+
+    def plain(*arguments: Any, **_: Any) -> Any:
+        return arguments[0] if arguments else lambda function: function
+
+    misc.torch_compile = plain
