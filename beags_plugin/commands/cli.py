@@ -56,8 +56,7 @@ class Demo:
     """Click on the objects in the viewer, which opens once the base is trained; the demo continues once they are saved.
     With --fresh they are picked again, on the same base."""
     objects: int = 1
-    """Number of salient things to separate, if they do not touch; with --pick, number of objects to click on and
-    name."""
+    """Number of salient things to separate, if they do not touch; with --pick, of objects to click on and name."""
     mask_source: str | None = None
     """Source of masks where there are none: salient, rembg, sam2, or your own (docs/masks.md); salient if left out."""
     mask_options: tuple[str, ...] = ()
