@@ -42,8 +42,7 @@ def names_of(data: Path, objects: int) -> tuple[str, ...]:
 
 
 def check_trained_otherwise(output: Path, fresh: bool, how: dict[str, Any]) -> None:
-    """Raise ``UserError``, before anything is trained, if the run that lies there was trained otherwise than
-    ``how``."""
+    """Raise ``UserError``, before anything is trained, if the run there was trained otherwise than ``how``."""
     run, stamp = output / "run", read_stamp(output)
     former = stamp.get(STARTED, stamp)
     if not fresh and (run / "training.json").exists() and {name: former.get(name) for name in how} != how:

@@ -199,8 +199,7 @@ class FinishedRunLoader(RunConfigLoader):
     def make_python_instance(
         self, suffix: str, node: Any, args: Any = None, kwds: Any = None, newobj: bool = False, unsafe: bool = False
     ) -> Any:
-        """Build as ``RunConfigLoader`` does; ``Record`` for classes that are not ours, such as nerfstudio's
-        enumerations."""
+        """Build as ``RunConfigLoader`` does; ``Record`` for other packages' classes, such as enumerations."""
         kind = self.find_python_name(suffix, node.start_mark)
         return Record() if kind is Record else super().make_python_instance(suffix, node, args, kwds, newobj, unsafe)
 

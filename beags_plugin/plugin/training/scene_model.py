@@ -115,8 +115,7 @@ class SceneModel(SplatfactoModel):
         return RasterSettings(self.config.near * extent, self.config.far * extent, geometry, distortion)
 
     def active_sh_degree(self) -> int:
-        """Return the SH degree to render: it grows by one at a time while the base trains; else it is the full
-        degree."""
+        """Return the SH degree to render: while the base trains it grows by one at a time up to the full degree."""
         if not self.training or self.schedule.warm or self.schedule.refining(self.step):
             return self.config.sh_degree
         interval = max(self.schedule.scaled(self.config.sh_degree_interval), 1)

@@ -22,8 +22,10 @@ _APART = 4.0  # Pixels of the page; nearer points are the same one, clicked twic
 
 @dataclass(frozen=True)
 class Place:
-    """A place under a click. point: [3] float64, nerfstudio's world. pixel: size of the page's pixels there, world
-    units."""
+    """A place under a click.
+
+    point: [3] float64, nerfstudio's world. pixel: size of the page's pixels there, world units.
+    """
 
     point: Tensor
     pixel: float

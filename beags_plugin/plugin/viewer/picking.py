@@ -75,8 +75,7 @@ class UnderCursor:
 
 
 def under_cursor(viewing: Viewing, origin: Sequence[float], direction: Sequence[float]) -> UnderCursor:
-    """Return the Gaussian that a viewer shows along a ray; raises ``UserError`` if there is none or the scene is
-    busy."""
+    """Return the Gaussian that a viewer shows along a ray; raises ``UserError`` if none is there or it is busy."""
     model = viewing.model
     with viewing.held_soon():
         scene = viewing.visible()

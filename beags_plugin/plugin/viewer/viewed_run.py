@@ -60,8 +60,7 @@ class ViewedRun:
 
     @property
     def note(self) -> str | None:
-        """Return a sentence for users if the files on disk are no longer those of this scene's preparation; else
-        None."""
+        """Return a sentence for users if the files on disk no longer belong to this scene's preparation."""
         folder = self._folder()
         if folder is None or not self._replaced(folder):
             return None

@@ -276,8 +276,7 @@ class Viewing:
             return self.model.surfels().detach().clone(), Membership(members.class_ids.clone(), members.objects)
 
     def refresh_shares(self) -> bool:
-        """Compute the shares behind ``occupancy_violation`` if the scene has changed; return whether they were
-        computed.
+        """Compute the shares behind ``occupancy_violation`` if the scene has changed, and return whether it has.
 
         The work happens outside the lock, so that neither training nor rendering waits. It takes at most a tenth of the
         time.

@@ -170,8 +170,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         return objects_alone(data) if self.config.photos == "objects" else data
 
     def _camera(self, index: int) -> Camera:
-        """Return a training view's whole camera on the device; the host knows its numbers too, so no step fetches
-        them."""
+        """Return a training view's whole camera on the device; the host has its numbers too, so no step waits."""
         if index not in self._cameras:
             self._cameras[index] = camera_from_nerfstudio(self.train_dataset.cameras, index).to(self.device)
         return self._cameras[index]
