@@ -49,7 +49,7 @@ class Pace:
         return level + 1 if seconds * (_GUESS if above is None else above / max(here, 1e-9)) < SECONDS else level
 
     def size(self, aspect: float, longest: int) -> tuple[int, int]:
-        """Return (height, width) of the next picture. aspect: width over height. longest: most pixels of either side."""
+        """Return (height, width) of the next picture. aspect: width over height. longest: most pixels of a side."""
         most = min(longest, int(longest / aspect))
         while self._level > 0 and _HEIGHT * 2 ** (self._level / 2 - 0.5) >= most:
             self._level -= 1  # The level below already fills the largest size.
