@@ -165,7 +165,7 @@ def test_the_viewer_shows_the_objects_of_every_refiner(refined, name, monkeypatc
             panel.object.value = scene.classes[class_id]
             panel.act("Isolate")
             shown = window.look_as_it_opens()["rgb"]
-            assert torch.equal(viewing.shown().index, members.of(class_id).nonzero()[:, 0])
+            assert torch.equal(viewing.visible().index, members.of(class_id).nonzero()[:, 0])
             inputs = surfel_inputs(surfels[members.of(class_id)], cameras[-1], model.active_sh_degree())
             alone = model.rasterizer.rasterize(inputs, cameras[-1], model.settings(), viewing.background)
             assert torch.equal(shown, alone.color.clamp(0.0, 1.0))

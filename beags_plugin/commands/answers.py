@@ -1,23 +1,28 @@
-"""What commands print, and the files that say the same."""
+"""The console of all commands, and JSON files of what they print."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
 from beags_plugin.system.whole_files import write_text_atomically
 
-CONSOLE = Console(soft_wrap=True, highlight=False)
-
-
-def counted_gaussians(count: int, left_out: object) -> str:
-    """Return a phrase on an object's Gaussians. left_out: those dropped, or None if nothing was looked for."""
-    return f"{count} Gaussians" if left_out is None else f"{count} Gaussians; {left_out}"
+CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # Paths may hold brackets.
 
 
 def write_json(path: Path | None, content: object) -> None:
     """Write ``content`` as JSON, paths as text, unless ``path`` is None; raises ``UserError`` if that fails."""
     if path is not None:
         write_text_atomically(json.dumps(content, indent=2, default=str) + "\n", path)
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file; empty if the file cannot be read or holds something else."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}

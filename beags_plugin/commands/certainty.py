@@ -1,8 +1,7 @@
-"""How sure ``beags demo`` is of what it made, in words: for its last lines and for summary.json."""
+"""Judge how reliable the result of ``beags demo`` is, in words for its last lines and for summary.json."""
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -10,29 +9,29 @@ from typing import Any
 
 import numpy as np
 
+from beags_plugin.commands.answers import read_object
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.masks.separate_things import Things
 from beags_plugin.system.pasted import quoted
 
-SURE, FAIR = 0.9, 0.75  # From such an agreement between views on, the demo is sure, and fairly sure.
-MANY = 0.1  # of the masks: with more overruled as a whole, it is not sure
-NAMED = 6  # photos in a sentence
-SMALL = 150  # pixels: an object whose longer side has fewer shows no print
-PICTURES = 6  # views in doubt.png
+SURE, FAIR = 0.9, 0.75  # Least agreement between the views for "sure" and "fairly sure".
+MANY = 0.1  # With a larger share of masks overruled as a whole, the demo is not sure.
+NAMED = 6  # Photos named in a sentence.
+SMALL = 150  # An object whose longer side has fewer pixels shows no printed text.
+PICTURES = 6  # Views in doubt.png.
 
 
 @dataclass(frozen=True)
 class Certainty:
-    """level: "sure", "fairly sure", "not sure", or "not judged" without masks that a network made. lines: sentences for
-    the user, what to do next among them. figures: what they are made of, plain values."""
+    """A judgement of a demo's result.
+
+    level: "sure", "fairly sure", "not sure", or "not judged" if no network made the masks. lines: sentences for the
+    user, with what to do next. figures: the values behind them, for JSON.
+    """
 
     level: str
     lines: list[str]
     figures: dict[str, Any] = field(default_factory=dict)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain values for summary.json."""
-        return {"level": self.level, "sentences": self.lines, **self.figures}
 
 
 def certainty(
@@ -40,12 +39,13 @@ def certainty(
 ) -> Certainty:
     """Judge a finished demo.
 
-    run: its run. scene: its photos' folder, with poses.json if poses were made. masks: the folder of masks that were
-    made, from which some may be deleted. again: the command that has the objects picked. apart: the folder in which
-    things were told apart, with what the masks agree on.
+    run: its run. scene: the folder of its photos, with poses.json if poses were computed. masks: the folder of made
+    masks, from which the user may delete some. again: the command with which the user picks the objects. apart: the
+    folder of the masks of separated things, with the report on their agreement.
     """
     lines, figures = [], {}
-    agreement = _json(apart / "report.json") if apart else _json(run / "prepared/report.json").get("agreement")
+    prepared = read_object(run / "prepared/report.json")
+    agreement = read_object(apart / "report.json") if apart else prepared.get("agreement")
     level = "not judged" if agreement is None else _level(agreement)
     if agreement is not None:
         figures["agreement"] = {name: agreement[name] for name in ("agreement", "masks", "overruled", "doubtful")}
@@ -54,7 +54,7 @@ def certainty(
     if things is not None:
         figures["things"] = asdict(things)
         lines += [things.sentence()] if things.sentence() else []
-    poses = _json(scene / "poses.json")
+    poses = read_object(scene / "poses.json")
     if {"photos", "registered"} <= set(poses):
         without = int(poses["photos"]) - int(poses["registered"])
         figures["photos without poses"] = without
@@ -95,7 +95,7 @@ def _next(again: str, agreement: dict[str, Any], masks: Path | None) -> list[str
 
 
 def _size(masks: Path) -> tuple[int, int] | None:
-    """Return the median width and height of the box about the objects in the masks that show them; None without."""
+    """Return the median width and height of the objects' bounding box in the masks, pixels; None without an object."""
     from beags_plugin.labels.classes import read_id_mask
 
     boxes = []
@@ -108,9 +108,9 @@ def _size(masks: Path) -> tuple[int, int] | None:
 
 
 def write_doubt(run: Path, path: Path, apart: Path | None = None) -> bool:
-    """Write a picture of the views whose masks changed most; return whether there is one, else remove an old one.
+    """Write a picture of the views whose masks changed most; if none changed, remove an old one and return False.
 
-    apart: the folder in which things were told apart, with such a picture.
+    apart: the folder of the masks of separated things, with such a picture.
     """
     if apart is not None and (apart / path.name).exists():
         shutil.copyfile(apart / path.name, path)
@@ -120,28 +120,20 @@ def write_doubt(run: Path, path: Path, apart: Path | None = None) -> bool:
     from beags_plugin.runs.relocation import open_run
     from beags_plugin.system.reading.images import read_image
 
-    agreement = _json(run / "prepared/report.json").get("agreement") or {"views": []}
-    moved = {each["view"]: each["changed"] + each["doubtful"] for each in agreement["views"]}
-    worst = sorted((name for name in moved if moved[name] > 0), key=lambda name: -moved[name])[:PICTURES]
+    agreement = read_object(run / "prepared/report.json").get("agreement") or {"views": []}
+    shares = {each["view"]: each["changed"] + each["doubtful"] for each in agreement["views"]}
+    worst = sorted((name for name in shares if shares[name] > 0), key=lambda name: -shares[name])[:PICTURES]
     if not worst:
         path.unlink(missing_ok=True)
         return False
     views = {each.name: each for each in training_masks(open_run(run / "config.yml"))}
-    shown = []
+    rows = []
     for name in worst:
         view = views[name]
         height, width = view.used.shape
         photo = read_image(view.photo, lambda image, size=(width, height): np.array(image.convert("RGB").resize(size)))
         changed = np.zeros(view.used.shape, bool) if view.given is None else view.given != view.used
         grey = np.where(view.used == IGNORE, 0, np.where(changed, 128, 255)).astype(np.uint8)
-        shown.append(Changed(name, photo, view.given, view.used, grey))
-    before_and_after(path, shown, "black: in doubt, grey: changed")
+        rows.append(Changed(name, photo, view.given, view.used, grey))
+    before_and_after(path, rows, "black: in doubt, grey: changed")
     return True
-
-
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}

@@ -5,17 +5,15 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
-from beags_plugin.system.child_processes import bound
+from beags_plugin.commands.answers import CONSOLE
 from beags_plugin.system.errors import UserError, check_choice
+from beags_plugin.system.pasted import command
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
@@ -23,8 +21,7 @@ if TYPE_CHECKING:
     from beags_plugin.commands.scene_setup import MadeScene
     from beags_plugin.evaluation.report import RunMetrics
 
-CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-REPORT, STAMP = "clean.json", "cleaning"  # STAMP: beside the run, marks it as made here
+REPORT, STAMP = "clean.json", "cleaning"  # STAMP lies beside a run that this command made.
 
 
 def clean_scene(
@@ -38,9 +35,9 @@ def clean_scene(
 ) -> None:
     """Refine the scene in ``path`` with the photos and masks in ``data``; write files and a report to ``output``.
 
-    objects: names of those that get a file of their own too. polish: base steps before, for a scene of 3D Gaussians.
-    steps: of refinement, the preset's if None. overwrite: replace a scene that was cleaned there before. Raises
-    ``UserError``.
+    objects: names of the objects that also get files of their own. polish: base steps before refinement, for a scene of
+    3D Gaussians. steps: of refinement, the preset's if None. overwrite: replace a scene that was cleaned there before.
+    Raises ``UserError``.
     """
     from beags_plugin.commands.scene_setup import made_scene
     from beags_plugin.importers.base import read_scene
@@ -50,7 +47,7 @@ def clean_scene(
     if polish < 0 or (steps is not None and steps < 1):
         raise UserError("--polish is 0 or more, and --steps 1 or more.")
     imported = read_scene(path)
-    wanted, output = format_of(path, imported), output or Path("outputs") / f"{path.stem}_cleaned"
+    written, output = format_of(path, imported), output or Path("outputs") / f"{path.stem}_cleaned"
     volume = imported.gaussians.log_scales.shape[1] == 3
     del imported
     run = output / "run"
@@ -68,20 +65,20 @@ def clean_scene(
     with progress_bar("Evaluating") as progress:
         metrics = evaluated.metrics(progress=progress)
     before, after = evaluated.stages["before"].surfels(), evaluated.stages["after"].surfels()
-    files = write_back(config, wanted, output, path.stem, objects)
+    files = write_back(config, written, output, path.stem, objects)
     report = {
         "scene": str(path.absolute()),
         "files": [str(file) for file in files],
         "start": json.loads((run / "start.json").read_text()),
         "polish": polish if volume else 0,
-        "changes": asdict(found := changes(before, after)),
+        "changes": asdict(changed := changes(before, after)),
         "metrics": metrics.to_json(),
     }
     write_text_atomically(json.dumps(report, indent=1, allow_nan=False), output / REPORT)
     for line in [
         *figures(report["start"], metrics),
-        str(found),
-        *filter(None, [wanted.note]),
+        str(changed),
+        *filter(None, [written.note]),
         *turned(report["start"]),
     ]:
         CONSOLE.print(line)
@@ -106,31 +103,32 @@ def check_names(scene: MadeScene, objects: Sequence[str]) -> None:
 
 def _train(path: Path, scene: MadeScene, run: Path, polish: int, steps: int | None) -> None:
     """Refine in a process of its own, as a user would."""
-    command = [
+    from beags_plugin.commands.demo_training import finish
+
+    words = [
         str(Path(sys.executable).parent / "ns-train"), "beags-refine", "--data", str(scene.data),
         "--run-dir", str(run.absolute()), "--vis", "tensorboard", "--pipeline.model.start-from", str(path),
         "--pipeline.model.base-steps", str(polish),
         *([] if steps is None else ["--pipeline.model.refine-steps", str(steps)]),
         "beags-data", *scene.options(),
     ]  # fmt: skip
-    CONSOLE.print("$ " + " ".join(command))
-    if (code := subprocess.run(bound(command)).returncode) != 0:
-        raise UserError(f"training ended with exit code {code}; what it printed above says why.")
+    CONSOLE.print(f"$ {command(words)}")
+    finish(words)
 
 
 def figures(start: dict[str, Any], metrics: RunMetrics) -> list[str]:
-    """Return the lines of the report on quality."""
+    """Return the lines on quality."""
     lost = start["flattening"]
     shape = "discs already" if lost is None else f"flattened: thinnest scale {lost['median_ratio']:.3f} of the second"
     held_out = start.get("held_out")
-    seen = f", {held_out['psnr']:.2f} dB in {held_out['views']} held-out views" if held_out else ""
-    lines = [f"as it came ({shape}): {start['psnr']:.2f} dB in {start['views']} training views{seen}"]
+    others = f", {held_out['psnr']:.2f} dB in {held_out['views']} held-out views" if held_out else ""
+    lines = [f"as it came ({shape}): {start['psnr']:.2f} dB in {start['views']} training views{others}"]
     stages = (metrics.before, "before refinement, held-out views"), (metrics.after, "after it")
-    for found, words in stages:
-        if found is None:
+    for scores, words in stages:
+        if scores is None:
             continue
-        facts = [] if found.psnr is None else [f"{found.psnr:.2f} dB"]
-        extracted = found.mean.extracted
+        facts = [] if scores.psnr is None else [f"{scores.psnr:.2f} dB"]
+        extracted = scores.mean.extracted
         if extracted is not None:
             names = (("IoU", extracted.iou), ("spill", extracted.spill))
             facts += [f"{name} {100 * value:.1f} %" for name, value in names if value is not None]
@@ -139,6 +137,6 @@ def figures(start: dict[str, Any], metrics: RunMetrics) -> list[str]:
 
 
 def turned(start: dict[str, Any]) -> list[str]:
-    """Return a sentence where the file had other axes than its format says."""
+    """Return a sentence if the file's axes were not those of its format."""
     words = start.get("turned")
-    return [f"The file's axes fitted after {words}; what is written lies in the poses' world."] if words else []
+    return [f"The scene fitted the poses only after {words}; the files are in the poses' world."] if words else []

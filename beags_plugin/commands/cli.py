@@ -1,8 +1,12 @@
-"""The command line ``beags``: one dataclass for each command, whose docstrings are the help, and how errors end."""
+"""The command line ``beags``: a dataclass per command, whose docstrings are its help.
+
+Other packages add commands by entry points ``beags.commands``, each a dataclass with ``run()``.
+"""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
@@ -13,13 +17,18 @@ from rich.markup import escape
 
 from beags_plugin.commands.answers import CONSOLE, write_json
 from beags_plugin.commands.masks import Masks
-from beags_plugin.commands.more import more_commands
 from beags_plugin.commands.of_runs import Clean, Eval, Export, Extract, Render
 from beags_plugin.commands.process import Process
-from beags_plugin.commands.starting import check_arguments, starting
-from beags_plugin.commands.view import View
+from beags_plugin.commands.starting import check_arguments, run_config, starting
 from beags_plugin.system.errors import UserError, refused, silence_libraries
 from beags_plugin.system.output_option import OUTPUT
+from beags_plugin.system.registry import Registry
+
+COMMANDS = Registry("command", "beags.commands", {})
+KNOWN = {
+    "bench": "beags bench is a package of its own: in a clone of beags, call pip install ./benchmarks, or make setup.",
+}
+"""Commands of packages of ours, with the sentence to print if the package is not installed."""
 
 
 @dataclass
@@ -32,9 +41,9 @@ class Demo:
     data: Path | None = None
     """Folder of a scene or of photos, or a video; the generated sample if left out."""
     output: Annotated[Path | None, OUTPUT] = None
-    """Where everything goes; outputs/demo, or outputs/<name of the data>."""
+    """Folder for everything; outputs/demo, or outputs/<name of the data>, if left out."""
     preset: str | None = None
-    """What to train with: a preset of method_configs/; if left out, beags-tiny for the sample, beags-fast for data."""
+    """Preset of method_configs/ to train; if left out, beags-tiny for the sample and beags-fast for data."""
     downscale: float | None = None
     """Divide the image size by this; chosen for a quick run if left out (a folder of your own only)."""
     seed: int = 0
@@ -44,14 +53,14 @@ class Demo:
     strict: bool = False
     """Stop where masks contradict one another, before anything is trained."""
     pick: bool = False
-    """Click on the objects in the viewer, which opens when the base is trained; the demo goes on once they are saved.
+    """Click on the objects in the viewer, which opens once the base is trained; the demo continues once they are saved.
     With --fresh they are picked again, on the same base."""
     objects: int = 1
-    """How many things that stand out to tell apart, where they do not touch; with --pick, to click on and name."""
+    """Number of salient things to separate, if they do not touch; with --pick, of objects to click on and name."""
     mask_source: str | None = None
-    """What makes masks where there are none: salient, rembg, sam2, or your own (docs/masks.md); salient if left out."""
+    """Source of masks where there are none: salient, rembg, sam2, or your own (docs/masks.md); salient if left out."""
     mask_options: tuple[str, ...] = ()
-    """Of the source, as key=value, e.g. model=isnet-general-use."""
+    """Options of the source, as key=value, e.g. model=isnet-general-use."""
 
     def run(self) -> None:
         with starting(self):
@@ -64,19 +73,19 @@ class Demo:
 
 @dataclass
 class Resume:
-    """Continue an interrupted training in its own folder; it ends as it would have without the interruption."""
+    """Continue an interrupted training in its own folder; the result is the same as without the interruption."""
 
     run_folder: tyro.conf.Positional[Path]
     """Folder of the run (or its config.yml)."""
 
     device: Literal["cpu", "cuda"] | None = None
-    """Continue on this device instead of where it was begun; the result is then not the same in every bit."""
+    """Continue on this device instead of the first one; the result is then no longer bit for bit the same."""
 
     data: Path | None = None
     """Folder of the photos, if not where the run was trained on them."""
 
     check_memory: bool = True
-    """Do not begin where hardly any memory or disk is free; save and stop when memory runs out."""
+    """Refuse to begin if hardly any memory or disk is free; save and stop when memory runs out."""
 
     def run(self) -> None:
         with starting(self):
@@ -85,6 +94,32 @@ class Resume:
             resume(self.run_folder, self.device, self.check_memory, self.data)
         except KeyboardInterrupt:
             sys.exit(130)
+
+
+@dataclass
+class View:
+    """Look at a run in the browser, pick and export objects; safe for runs of other people.
+
+    Nothing that its files name is executed, and only this computer is served. Ctrl-C ends it.
+    """
+
+    run_folder: tyro.conf.Positional[Path]
+    """Folder of the run (or its config.yml)."""
+    port: int | None = None
+    """Port of this computer; the first free one from 7007 on if left out."""
+    data: Path | None = None
+    """Folder of the photos, if not where the run was trained on them."""
+    save_to: Path | None = None
+    """Folder for Save as masks, which then ends the viewer: how beags demo --pick asks for objects."""
+    expect: tuple[str, ...] = ("object 1",)
+    """With --save-to: the objects to be picked, under these names if they get no others."""
+
+    def run(self) -> None:
+        with starting(self):
+            from beags_plugin.plugin.viewer.errand import Errand
+            from beags_plugin.plugin.viewer.serve import serve
+        errand = None if self.save_to is None else Errand(self.save_to.absolute(), self.expect)
+        serve(run_config(self.run_folder), self.data, self.port, errand)
 
 
 @dataclass
@@ -125,7 +160,7 @@ class Sample:
             exposure=self.exposure, white_balance=self.white_balance, moved=self.moved,
             shared_damage=self.shared_damage,
         )  # fmt: skip
-        CONSOLE.print(f"sample: {self.output}", markup=False)
+        CONSOLE.print(f"sample: {self.output}")
 
 
 @dataclass
@@ -160,13 +195,30 @@ def all_commands(arguments: list[str] | None) -> Any:
     """Return the union of our commands and, unless the arguments name one of ours, of other packages' commands."""
     ours = [command.__name__.lower() for command in get_args(Command)]
     first = next(iter(sys.argv[1:] if arguments is None else arguments), "")
-    return Command if first in ours else Union[(Command, *more_commands(first, ours))]  # noqa: UP007  (of a tuple)
+    return Command if first in ours else Union[(Command, *other_commands(first, ours))]  # noqa: UP007  (of a tuple)
+
+
+def other_commands(first: str, taken: Collection[str]) -> list[Any]:
+    """Return commands of other packages, for tyro: only the one named ``first`` if there is one, else all.
+
+    taken: names of our own. Raises ``UserError`` for a name that is taken, a command that fails to load, and one of
+    ``KNOWN`` that is not installed.
+    """
+    names = COMMANDS.names()
+    if twice := sorted({*names} & {*taken}):
+        raise UserError(
+            f"another package adds a command {twice[0]!r}, which beags has already: uninstall that package."
+        )
+    if first in KNOWN and first not in names:
+        raise UserError(KNOWN[first])
+    chosen = [first] if first in names else names
+    return [Annotated[COMMANDS.get(name), tyro.conf.subcommand(name)] for name in chosen]
 
 
 def exit_with(error: UserError) -> NoReturn:
     """Print a user error, unless the trainer has printed it, and end with exit code 2."""
     if not error.reported:
-        CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}")
+        CONSOLE.print(f"[bold red]beags:[/bold red] {escape(str(error))}", markup=True)
     sys.exit(2)
 
 
@@ -185,7 +237,7 @@ def main(arguments: list[str] | None = None) -> None:
             raise
         exit_with(described)
     except KeyboardInterrupt:
-        CONSOLE.print("[bold red]beags:[/bold red] interrupted.")
+        CONSOLE.print("[bold red]beags:[/bold red] interrupted.", markup=True)
         sys.exit(130)
 
 

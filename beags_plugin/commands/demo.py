@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from rich.console import Console
-
+from beags_plugin.commands.answers import CONSOLE
 from beags_plugin.commands.demo_picks import (
     APART,
     check_one_object,
@@ -21,13 +18,12 @@ from beags_plugin.commands.demo_picks import (
     picked_scene,
     things_apart,
     trained_base,
-    with_made_masks,
 )
 from beags_plugin.commands.demo_training import STARTED, read_stamp, train_once
 from beags_plugin.system.digests import code_digest, value_digest
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.pasted import command, quoted
-from beags_plugin.system.progress import progress_bar
+from beags_plugin.system.progress import progress_bar, timed
 from beags_plugin.system.whole_files import write_text_atomically
 
 if TYPE_CHECKING:
@@ -37,11 +33,10 @@ if TYPE_CHECKING:
     from beags_plugin.objects.extract import Extracted
     from beags_plugin.plugin.options.model_options import BeagsModelConfig
 
-CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-BEFORE = ("sample", "poses", "poses and masks", "base training")  # stages before the training that is measured
+BEFORE = ("sample", "poses", "poses and masks", "base training")  # Stages before the training that is measured.
 PRESET, PRESET_OF_PHOTOS = "beags-tiny", "beags-fast"
 SIZE, DOWNSCALE = (640, 480), 2.5
-"""Width and height of the generated photos, and what whole ones are divided by in training."""
+"""Width and height of the generated photos, and their downscale factor in training."""
 GENERATED = ("--pipeline.datamanager.focus", "auto", "--pipeline.datamanager.dense-seeds", "off")
 """Options of training on the generated photos."""
 
@@ -86,7 +81,7 @@ def run_demo(
             check_one_object(scene, data)
         if strict:
             check_contradictions(scene, output)
-        read_dataset(scene.data)  # reports what is missing before a training starts
+        read_dataset(scene.data)  # It reports what is missing before a training starts.
         downscale = downscale or quick_downscale(scene.data)
     request = {"preset": preset, "downscale": downscale}
     if pick:
@@ -113,7 +108,7 @@ def run_demo(
 def _trained_by_masks(
     scene: MadeScene, output: Path, request: dict[str, Any], fresh: bool, words: Sequence[str]
 ) -> None:
-    """Train a scene with the masks that it has; words: further options of the training."""
+    """Train a scene with its masks; words: further options of the training."""
     from beags_plugin.runs.prepared import photos_contradict
 
     request = {**request, "inputs": inputs_digest(scene, output, request["preset"])}
@@ -134,12 +129,14 @@ def _trained_on_base(
 ) -> MadeScene:  # fmt: skip
     """Train the base of a scene, and refine it with masks made on it; return the scene with these masks.
 
-    how: what tells the run from one that was trained in one go. with_masks: from the base's run to the scene.
+    how: entries of the request by which the run differs from one without such masks. with_masks: takes the folder of
+    the base's run, and returns the scene with masks.
     """
     from beags_plugin.runs.prepared import photos_contradict
 
-    kept = inputs_digest(with_made_masks(scene, output), output, request["preset"])
-    base = trained_base(replace(scene, labels=None), output, request, {**request, "inputs": kept}, fresh)
+    made = output / "made"  # A demo without picks trains with the masks that it has made here.
+    inputs = inputs_digest(replace(scene, labels=made if made.exists() else None), output, request["preset"])
+    base = trained_base(replace(scene, labels=None), output, request, {**request, "inputs": inputs}, fresh)
     seconds["base training"] = json.loads((base / "training.json").read_text())["seconds"].get("base training", 0.0)
     scene = with_masks(base)
     request = {**request, "inputs": inputs_digest(scene, output, request["preset"]), **how}
@@ -147,8 +144,8 @@ def _trained_on_base(
     train_once(scene, output, request, fresh, words=words)
     if photos_contradict(output / "run"):
         CONSOLE.print(
-            "The photos contradict each other outside the masks, as on a turntable: poses and training are of the "
-            "objects alone without --pick and --objects."
+            "The photos contradict each other outside the masks, as on a turntable: without --pick and --objects, "
+            "poses and training use the objects' pixels alone."
         )
     return scene
 
@@ -166,7 +163,7 @@ def _check_objects(data: Path | None, pick: bool, objects: int, strict: bool) ->
 
 
 def _again(data: Path | None, output: Path | None, preset: str | None, downscale: float | None, objects: int) -> str:
-    """Return the command that goes on, or picks."""
+    """Return the command that continues this demo by picking."""
     words = ["beags", "demo", *([] if data is None else ["--data", str(data)])]
     for name, value in (("output", output), ("preset", preset), ("downscale", downscale)):
         words += [] if value is None else [f"--{name}", str(value)]
@@ -174,9 +171,9 @@ def _again(data: Path | None, output: Path | None, preset: str | None, downscale
 
 
 def check_contradictions(scene: MadeScene, output: Path) -> None:
-    """Raise ``UserError`` where the views contradict masks, as the points say that several saw (``beags masks check``).
+    """Raise ``UserError`` where masks contradict the other views at shared points (``beags masks check``).
 
-    output: of the demo, which gets contradicted.png.
+    output: folder of the demo; it gets contradicted.png.
     """
     from beags_plugin.objects.check_masks import check_scene, options_beside, write_contradictions
 
@@ -193,7 +190,7 @@ def check_contradictions(scene: MadeScene, output: Path) -> None:
 
 
 def check_preset(preset: str) -> None:
-    """Raise ``UserError`` unless the preset trains a base and refines it, which is what the demo compares."""
+    """Raise ``UserError`` unless the preset trains a base and refines it, because the demo compares the two."""
     from beags_plugin.plugin.presets import load_preset, preset_names
 
     check_choice(preset, preset_names(), "preset")
@@ -203,7 +200,7 @@ def check_preset(preset: str) -> None:
 
 
 def inputs_digest(scene: MadeScene, output: Path, preset: str) -> str:
-    """Return what changes with the preset, the package's code and any file of the data (by name, size and time)."""
+    """Return a digest of the preset, the package's code and the files of the data (by name, size and time)."""
     from beags_plugin.plugin.presets import preset_files
 
     texts = [path.read_text("utf8") for path in preset_files(preset)]
@@ -213,7 +210,7 @@ def inputs_digest(scene: MadeScene, output: Path, preset: str) -> str:
 def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene, again: str = "") -> None:
     """Compare assignment alone with refinement, extract every object, write summary.json and the pictures.
 
-    again: the command that has the objects picked.
+    again: the command with which the user picks the objects.
     """
     from beags_plugin.commands.certainty import certainty, write_doubt
     from beags_plugin.evaluation.table import render_run, summary_json
@@ -243,7 +240,8 @@ def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene
     memory = training["peak_memory_mb"]
     apart = scene.labels if scene.labels == output / APART else None
     sure = certainty(run, scene.data, scene.made_masks, again, apart)
-    summary = {**summary_json(metrics, stages, memory), "certainty": sure.to_json()}
+    judged = {"level": sure.level, "sentences": sure.lines, **sure.figures}
+    summary = {**summary_json(metrics, stages, memory), "certainty": judged}
     write_text_atomically(json.dumps(summary, indent=2), output / "summary.json")
     doubt = write_doubt(run, output / "doubt.png", apart)
     CONSOLE.print(render_run(metrics, stages, memory))
@@ -264,16 +262,8 @@ def _alone(run: EvaluatedRun, written: Sequence[Extracted]) -> dict[int, dict[st
 
     base = run.stages["before"]
     objects = {each: select_class(base.surfels(), base.members, each)[0] for each in run.classes if each != 0}
-    found = {class_id: {"before": surfels} for class_id, surfels in objects.items()}
+    stages = {class_id: {"before": surfels} for class_id, surfels in objects.items()}
     for scene in (read_run(each.config) for each in written):
         if len(scene.members):
-            found[int(scene.members.class_ids[0])]["after"] = scene.surfels()
-    return found
-
-
-@contextmanager
-def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
-    """Measure the wall time of the block into ``seconds[name]``."""
-    start = time.perf_counter()
-    yield
-    seconds[name] = time.perf_counter() - start
+            stages[int(scene.members.class_ids[0])]["after"] = scene.surfels()
+    return stages

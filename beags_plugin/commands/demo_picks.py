@@ -11,8 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
+from beags_plugin.commands.answers import CONSOLE, read_object
 from beags_plugin.commands.demo_training import (
     STARTED,
     difference,
@@ -30,21 +29,20 @@ from beags_plugin.system.digests import folder_digest, value_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.whole_files import write_text_atomically
 
-CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-APART_STAMP = "apart.json"  # in it: what the masks were made of, and what they were then
-APART = "apart"  # in the output: masks/, classes.json, report.json and doubt.png of things that lie apart
-FOLDER = "pick"  # in the output: run/, the base; masks/ and classes.json, what was picked
-OF_MASKS = ("masks", "masks_to_look_at", "classes.json", MADE, *OWN_PICTURES)  # of a scene: nothing of its base
+APART = "apart"  # Folder in the output: masks/, classes.json, report.json and doubt.png of separated things.
+APART_STAMP = "apart.json"  # In APART: digests of the inputs of these masks, and of the masks as they were made.
+FOLDER = "pick"  # Folder in the output: run/ is the base; masks/ and classes.json hold the picked objects.
+OF_MASKS = ("masks", "masks_to_look_at", "classes.json", MADE, *OWN_PICTURES)  # Files that a base does not depend on.
 
 
 def names_of(data: Path, objects: int) -> tuple[str, ...]:
-    """Return what so many objects of photos are called until somebody names them."""
+    """Return the names of so many objects until the user names them."""
     name = object_name(data)
     return (name,) if objects == 1 else tuple(f"{name} {number}" for number in range(1, objects + 1))
 
 
 def check_trained_otherwise(output: Path, fresh: bool, how: dict[str, Any]) -> None:
-    """Raise ``UserError`` where a demo without masks made on its base would be replaced: before anything is trained."""
+    """Raise ``UserError``, before anything is trained, if the run there was trained otherwise than ``how``."""
     run, stamp = output / "run", read_stamp(output)
     former = stamp.get(STARTED, stamp)
     if not fresh and (run / "training.json").exists() and {name: former.get(name) for name in how} != how:
@@ -55,7 +53,7 @@ def check_trained_otherwise(output: Path, fresh: bool, how: dict[str, Any]) -> N
 
 
 def check_one_object(scene: MadeScene, data: Path) -> None:
-    """Raise ``UserError`` where masks are not of one object that things can be told apart in."""
+    """Raise ``UserError`` unless a network made the masks, of one object, which can be split into things."""
     folder = scene.labels or scene.data
     names = json.loads((folder / "classes.json").read_text()) if (folder / MADE).exists() else {}
     if len(set(names) - {"0"}) != 1:
@@ -65,19 +63,13 @@ def check_one_object(scene: MadeScene, data: Path) -> None:
         )
 
 
-def with_made_masks(scene: MadeScene, output: Path) -> MadeScene:
-    """Return the scene as the demo without picks trains it, with masks that it has made elsewhere."""
-    made = output / "made"
-    return replace(scene, labels=made if made.exists() else None)
-
-
 def trained_base(
     scene: MadeScene, output: Path, request: dict[str, Any], without_picks: dict[str, Any], fresh: bool
 ) -> Path:
-    """Return the run of the base of a scene; it is trained unless it was before.
+    """Return the run of a scene's base, which is trained unless that was done before.
 
-    request: preset and size. without_picks: the request of a demo without picks, whose base is the same. fresh: replace
-    a base that was trained otherwise. Raises ``UserError`` as ``train_once`` does.
+    request: preset and size. without_picks: the request of a demo without picks, which has the same base. fresh:
+    replace a base that was trained otherwise. Raises ``UserError`` as ``train_once`` does.
     """
     folder = output / FOLDER
     request = {**request, "inputs": value_digest([_base_digest(scene, output), "base"])}
@@ -93,18 +85,17 @@ def trained_base(
 def picked_scene(
     scene: MadeScene, output: Path, base: Path, names: Sequence[str], fresh: bool, again: str
 ) -> MadeScene:
-    """Return the scene with the masks of what was picked on its base; the viewer opens unless that was done before.
+    """Return the scene with masks of the objects picked on its base; the viewer opens unless that was done before.
 
-    names: of the objects that are expected. again: the command that goes on. Raises ``UserError`` where nothing is
-    saved.
+    names: of the expected objects. again: the command that continues. Raises ``UserError`` if nothing is saved.
     """
     from beags_plugin.objects.picked_masks import STAMP, masks_changed
 
     folder = base.parent
-    there = any((folder / "masks").rglob("*.png"))
-    if there and masks_changed(folder):
-        CONSOLE.print(f"{folder / 'masks'} are not as they were picked, so they stay: delete them for new ones.")
-    elif there and not fresh:
+    exist = any((folder / "masks").rglob("*.png"))
+    if exist and masks_changed(folder):
+        CONSOLE.print(f"The masks in {folder / 'masks'} were mended, so they stay: delete them for new ones.")
+    elif exist and not fresh:
         CONSOLE.print(f"Picked before: {folder / 'made.png'} (add --fresh to pick again).")
     else:
         before = _changed_at(folder / STAMP)
@@ -115,8 +106,9 @@ def picked_scene(
 
 
 def things_apart(scene: MadeScene, output: Path, base: Path, objects: int) -> MadeScene:
-    """Return the scene with masks of so many things that lie apart in the base, or of fewer; made anew unless they were
-    before, of the same masks and base, or somebody has mended them.
+    """Return the scene with masks of at most so many things that lie apart in the base.
+
+    Masks made before of the same masks and base are used again, and masks that the user mended are kept.
     """
     from beags_plugin.objects.agree_masks import agree_masks
     from beags_plugin.objects.reproject_masks import ReprojectionOptions
@@ -124,11 +116,11 @@ def things_apart(scene: MadeScene, output: Path, base: Path, objects: int) -> Ma
     folder, given = output / APART, scene.labels or scene.data
     masks, stamp = folder / "masks", folder / APART_STAMP
     made_of = value_digest([folder_digest(given / "masks"), _changed_at(base / "training.json"), objects])
-    former = json.loads(stamp.read_text()) if stamp.exists() else {}
+    former = read_object(stamp)
     if former.get("of") == made_of and any(masks.rglob("*.png")):
-        CONSOLE.print(f"Told apart before: {masks}.")
+        CONSOLE.print(f"Separated before: {masks}.")
     elif former and former.get("masks") != folder_digest(masks):
-        CONSOLE.print(f"The masks in {masks} are not as they were made, so they stay: delete {folder} for new ones.")
+        CONSOLE.print(f"The masks in {masks} were mended, so they stay: delete {folder} for new ones.")
     else:
         shutil.rmtree(folder, ignore_errors=True)
         options = ReprojectionOptions(given / "masks", given / "classes.json", run_size=True)
@@ -156,7 +148,7 @@ def _go_on(again: str) -> str:
 
 
 def _copy_base(run: Path, folder: Path, request: dict[str, Any]) -> None:
-    """Take the base that a demo without picks has kept."""
+    """Copy the base of a demo without picks."""
     unfinished = folder / "run.unfinished"
     shutil.rmtree(unfinished, ignore_errors=True)
     shutil.copytree(run / "base", unfinished)

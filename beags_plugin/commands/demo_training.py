@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
+from beags_plugin.commands.answers import CONSOLE, read_object
 from beags_plugin.commands.scene_setup import MadeScene
 from beags_plugin.system.child_processes import bound
 from beags_plugin.system.errors import UserError
@@ -20,21 +19,20 @@ from beags_plugin.system.lock import run_lock
 from beags_plugin.system.pasted import command, quoted
 from beags_plugin.system.whole_files import write_text_atomically
 
-CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-STAMP = "trained.json"  # beside the run: the request that it was made from
-STARTED = "started"  # the key that holds the request until the training ends
-AGREE = ("--pipeline.model.prepare.agree", "True")  # a network's masks err in many views alike
-QUIET = ("--logging.steps-per-log", "50", "--logging.local-writer.max-log-size", "0")  # where no table can be redrawn
+STAMP = "trained.json"  # This file beside the run holds the request that it was trained for.
+STARTED = "started"  # This key of it holds the request until the training ends.
+AGREE = ("--pipeline.model.prepare.agree", "True")  # A network's masks have the same errors in many views.
+QUIET = ("--logging.steps-per-log", "50", "--logging.local-writer.max-log-size", "0")  # Used if output is no terminal.
 
 
 def train_once(
     scene: MadeScene, output: Path, request: dict[str, Any], fresh: bool, replace: bool = False,
     words: Sequence[str] = (),
 ) -> None:  # fmt: skip
-    """Train what is requested, unless that was done before, or resume it.
+    """Train what is requested unless that was done before; resume it if it was interrupted.
 
-    replace: the run that lies there is a step on the way to this one. words: further options of the training. Raises
-    ``UserError`` where another run, trained to its end, would be replaced.
+    replace: whether a complete run may be replaced, because it was a step on the way to this one. words: further
+    options of the training. Raises ``UserError`` if another complete run would be replaced.
     """
     run = output / "run"
     if not fresh and trained(output, request):
@@ -43,8 +41,8 @@ def train_once(
     if run.exists() and not (output / STAMP).exists():
         raise UserError(f"{run} is not the demo's: choose another --output, or move it away.")
     if run.is_dir():
-        run_lock(run).release()  # refuses if the same demo is being trained
-    if not fresh and _interrupted(output, request):
+        run_lock(run).release()  # It raises if the same demo is being trained.
+    if not fresh and read_stamp(output).get(STARTED) == request and (run / "config.yml").exists():
         resume(run)
     else:
         if (run / "training.json").exists() and not (fresh or replace):
@@ -59,27 +57,23 @@ def train_once(
 
 
 def write_stamp(output: Path, content: dict[str, Any]) -> None:
-    """Write the request that the run in ``output`` was made from, or, under ``STARTED``, is being made from."""
+    """Write the request of the run in ``output``; under ``STARTED`` as long as it is being trained."""
     write_text_atomically(json.dumps(content), output / STAMP)
 
 
 def read_stamp(output: Path) -> dict[str, Any]:
-    """Return what ``write_stamp`` wrote; empty where there is nothing that can be read."""
-    try:
-        former = json.loads((output / STAMP).read_text())
-    except (OSError, ValueError):
-        return {}
-    return former if isinstance(former, dict) else {}
+    """Return what ``write_stamp`` wrote; empty if that cannot be read."""
+    return read_object(output / STAMP)
 
 
 def trained(output: Path, request: dict[str, Any]) -> bool:
-    """Return whether the same request was trained before, to its end."""
+    """Return whether the same request was trained to its end."""
     former = read_stamp(output)
     return request in (former, former.get(STARTED)) and (output / "run" / "training.json").exists()
 
 
 def difference(stamp: dict[str, Any], request: dict[str, Any]) -> str:
-    """Return in which way an earlier request, as its stamp holds it, differs from ``request``."""
+    """Describe how the earlier request in a stamp differs from ``request``."""
     former = stamp.get(STARTED, stamp)
     if bool(former.get("pick")) != bool(request.get("pick")):
         return "with --pick" if former.get("pick") else "without --pick"
@@ -89,11 +83,6 @@ def difference(stamp: dict[str, Any], request: dict[str, Any]) -> str:
         if former.get(name) != request.get(name):
             return f"with {flag} {former.get(name)}"
     return "from other data or by another version"
-
-
-def _interrupted(output: Path, request: dict[str, Any]) -> bool:
-    """Return whether a training of the same request was interrupted and can resume."""
-    return read_stamp(output).get(STARTED) == request and (output / "run" / "config.yml").exists()
 
 
 def train(scene: MadeScene, run: Path, preset: str, downscale: float, photos: str, words: Sequence[str] = ()) -> None:
@@ -118,7 +107,7 @@ def resume(run: Path) -> None:
 
 
 def quiet_environment() -> dict[str, str]:
-    """Return the environment of a child process, in which other libraries do not warn of what they will change."""
+    """Return the environment of a child process in which other libraries print no warnings of future changes."""
     return {**os.environ, "PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS", "ignore::FutureWarning")}
 
 

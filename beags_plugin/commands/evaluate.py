@@ -10,20 +10,18 @@ from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 
-from rich.console import Console
-
+from beags_plugin.commands.answers import CONSOLE
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
-CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 PICTURES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """Files to write, each of them optional. worst: number of masks of each kind in the picture."""
+    """Files to write; None writes none. worst: number of masks of each kind in the picture."""
 
     json: Path | None = None
     csv: Path | None = None
@@ -68,14 +66,14 @@ def run_evaluation(
                 worst += evaluated.worst(metrics, outputs.worst, progress=progress)
         runs.append(metrics)
         CONSOLE.print(render_run(metrics))
-    found = data_set(data_set_name, runs)
+    scores = data_set(data_set_name, runs)
     if len(runs) > 1:
-        CONSOLE.print(render_data_set(found))
+        CONSOLE.print(render_data_set(scores))
     if outputs.json is not None:
-        _write(outputs.json, json.dumps(found.to_json(), indent=1, allow_nan=False))
+        _write(outputs.json, json.dumps(scores.to_json(), indent=1, allow_nan=False))
     if outputs.csv is not None:
         text = StringIO()
-        csv.writer(text, lineterminator="\n").writerows([CSV_COLUMNS, *found.csv_rows()])
+        csv.writer(text, lineterminator="\n").writerows([CSV_COLUMNS, *scores.csv_rows()])
         _write(outputs.csv, text.getvalue().rstrip("\n"))
     if outputs.picture is not None and worst:
         write_picture(outputs.picture, worst_views_picture(worst, outputs.worst))

@@ -7,14 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from rich.console import Console
-
+from beags_plugin.commands.answers import CONSOLE
 from beags_plugin.commands.starting import starting
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.output_option import OUTPUT
 from beags_plugin.system.pasted import command
-
-CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 
 
 @dataclass
@@ -29,7 +26,7 @@ class Check:
     data: Path | None = None
     """Folder of the scene; that of the run if left out."""
     load_config: Path | None = None
-    """A run (folder or config.yml) trained on the scene, beags-base will do; its depth shows where views disagree."""
+    """A run (folder or config.yml) trained on the scene, even of beags-base; its depth shows where views disagree."""
     layout: str | None = None
     """How the data set lays out its files (docs/data.md); as in the run, else auto, which recognises it."""
     images_path: Path | None = None
@@ -61,7 +58,7 @@ class Check:
             CONSOLE.print(f"Next: {self._agreement(report.data)}")
         if report.stops:
             if self.load_config is not None:
-                CONSOLE.print("The run is asked once no error is left.")
+                CONSOLE.print("The trained run is compared only once all errors are mended.")
             sys.exit(1)
 
     def _agreement(self, scene: Path) -> str:
@@ -74,10 +71,10 @@ class Check:
 
 @dataclass
 class Reproject:
-    """Let all views vote on each other's masks with the depth of a trained run; write what they agree on."""
+    """Let all views vote on each other's masks, with the depth of a trained run; write the result."""
 
     load_config: Path
-    """Any trained run, its folder or config.yml in it; beags-base will do."""
+    """Any trained run, even of beags-base: its folder, or config.yml in it."""
     masks_path: Path | None = None
     """Folder of the id images, if not those that the run was trained on."""
     classes_path: Path | None = None
@@ -110,28 +107,28 @@ class Reproject:
         options = ReprojectionOptions(
             self.masks_path, self.classes_path, self.method, self.tau, self.depth, self.run_size, data=self.data
         )
-        found = reproject_run(self.load_config, options)
+        masks = reproject_run(self.load_config, options)
         output = self.output or self.load_config.parent / "reprojected"
-        for line in write_reprojection(found, output, self.min_confidence):
+        for line in write_reprojection(masks, output, self.min_confidence):
             CONSOLE.print(line)
 
 
 @dataclass
 class Agree:
-    """Make masks agree that a network made: views that the others contradict lose their say, and are drawn anew.
+    """Make masks that a network made agree: views that the others contradict lose their vote, and are redrawn.
 
     Each Gaussian of a trained run gets one class, by the votes of all views and by cuts along creases, edges of depth
     and changes of colour. Pixels that stay in doubt are written as unlabelled (65535).
     """
 
     load_config: Path
-    """Any trained run, its folder or config.yml in it; beags-base will do."""
+    """Any trained run, even of beags-base: its folder, or config.yml in it."""
     masks_path: Path | None = None
     """Folder of the id images, if not those that the run was trained on."""
     classes_path: Path | None = None
     """File {"id": "name"} for them; classes.json beside the folder if there is one."""
     objects: int = 1
-    """Split the one object of the masks into so many things, where they lie apart in space."""
+    """Split the one object of the masks into at most so many things, where they lie apart in space."""
     run_size: bool = False
     """Work at the size that was trained on instead of that of the photographs: quicker, smaller masks."""
     data: Path | None = None
@@ -159,9 +156,9 @@ class Make:
     source: str
     """id-images, object-images, coco, gaussian-grouping, langsplat, cut, grabcut, salient, rembg, sam2, or your own."""
     options: tuple[str, ...] = ()
-    """Of the source, as key=value, e.g. prompts=prompts.json."""
+    """Options of the source, as key=value, e.g. prompts=prompts.json."""
     load_config: Path | None = None
-    """A run (folder or config.yml) trained on the scene, beags-base will do; for sources that need its depth."""
+    """A run (folder or config.yml) trained on the scene, even of beags-base; for sources that need its depth."""
     output: Annotated[Path | None, OUTPUT] = None
     """Folder for masks/, classes.json and made.png; the scene's own if left out."""
     overwrite: bool = False
@@ -169,7 +166,7 @@ class Make:
     snap: int = 0
     """Move boundaries to edges of the photo, by at most this many pixels; 0 leaves them."""
     upright: bool = False
-    """The source's masks are of upright photos: turn them as the photos are stored (EXIF orientation)."""
+    """The source's masks belong to upright photos: turn them to match the stored photos (EXIF orientation)."""
     layout: str = "auto"
     """How the data set lays out its files (docs/data.md); auto recognises it."""
     images_path: Path | None = None
@@ -189,7 +186,7 @@ class Make:
 
 @dataclass
 class Truth:
-    """Take downloaded masks of a scene of LLFF as truth to evaluate with; scribbles become prompts for masks."""
+    """Take downloaded masks of a scene of LLFF as ground truth for beags eval; scribbles become prompts for masks."""
 
     data: Path
     """Folder of the scene; its name is the scene's, else give --scene."""
@@ -198,9 +195,9 @@ class Truth:
     spin_nerf: Path | None = None
     """The folder of SPIn-NeRF's masks, <scene>/<photo>.png."""
     scene: str | None = None
-    """What the download calls the scene, if not like the folder."""
+    """The scene's name in the download, if it is not the folder's."""
     object: str | None = None
-    """What SPIn-NeRF's object is called in classes.json; as the scene if left out."""
+    """Name of SPIn-NeRF's object in classes.json; the scene's name if left out."""
     overwrite: bool = False
     """Replace masks and prompts that are there already."""
     layout: str = "auto"

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from beags_plugin.commands.answers import CONSOLE, counted_gaussians, write_json
+from beags_plugin.commands.answers import CONSOLE, write_json
 from beags_plugin.commands.starting import starting
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.export.pose_options import PoseOptions
@@ -36,9 +36,9 @@ class Extract:
     json: Path | None = None
     """File that lists what was written."""
     keep_all: bool = False
-    """Also keep Gaussians that do not belong: spikes outside the object's masks, loose parts that no mask supports."""
+    """Also keep Gaussians that do not belong to it: spikes outside its masks, loose parts that no mask supports."""
     data: Path | None = None
-    """Folder of the photos, if not where the run was trained on them; its cameras tell what belongs."""
+    """Folder of the photos, if they were moved; which Gaussians belong to an object is decided in its views."""
 
     def run(self) -> None:
         with starting(self):
@@ -51,13 +51,11 @@ class Extract:
             )  # fmt: skip
         write_json(self.json, [asdict(done) for done in extracted])
         for done in extracted:
-            CONSOLE.print(
-                f"{done.name}: {counted_gaussians(done.gaussians, done.left_out)}\n  {done.ply}\n"
-                f"  beags view {quoted(done.config.parent)}",
-                markup=False,
-            )
+            dropped = "" if done.left_out is None else f"; {done.left_out}"
+            CONSOLE.print(f"{done.name}: {done.gaussians} Gaussians{dropped}\n  {done.ply}")
+            CONSOLE.print(f"  beags view {quoted(done.config.parent)}")
         for sentence in sentences:
-            CONSOLE.print(sentence, markup=False)
+            CONSOLE.print(sentence)
 
 
 @dataclass
@@ -83,9 +81,9 @@ class Export:
     json: Path | None = None
     """File that lists what was written."""
     data: Path | None = None
-    """Folder of the photos, if not where the run was trained on them. Meshes need it; its cameras tell what belongs."""
+    """Folder of the photos, if they were moved. Meshes need it, and the choice of what belongs to an object."""
     keep_all: bool = False
-    """Also keep Gaussians that do not belong: spikes outside an object's masks, loose parts that no mask supports."""
+    """Also keep Gaussians that do not belong to it: spikes outside its masks, loose parts that no mask supports."""
     close: bool = False
     """Close objects where no photo shows them, such as underneath, with Gaussians or triangles that a .ply and a .glb
     mark as invented; .stl and .3mf are always closed."""
@@ -107,11 +105,11 @@ class Export:
             )  # fmt: skip
         write_json(self.json, [asdict(one) for one in exported])
         for one in exported:
-            CONSOLE.print(str(one), markup=False)
+            CONSOLE.print(str(one))
             for file in one.files:
-                CONSOLE.print(f"  {file}", markup=False)
+                CONSOLE.print(f"  {file}")
         for sentence in sentences:
-            CONSOLE.print(sentence, markup=False)
+            CONSOLE.print(sentence)
 
 
 @dataclass
@@ -124,13 +122,13 @@ class Clean:
     scene: tyro.conf.Positional[Path]
     """The splat file: .ply, .spz, .sog, .splat, .glb, .usdz and others (docs/export.md), or a run of splatfacto."""
     data: Path
-    """Folder of the photos, with the poses in whose world the scene lies, and id masks."""
+    """Folder of the photos, of id masks, and of poses in the frame of the scene."""
     object: tuple[str, ...] = ()
     """Names of objects that get a file of their own too."""
     output: Annotated[Path | None, OUTPUT] = None
     """Folder for the files, the report and the run; outputs/<scene>_cleaned if left out."""
     polish: int = 300
-    """Base steps before refinement that repair what flattening costs a scene of 3D Gaussians."""
+    """Base steps before refinement; they repair the loss from flattening a scene of 3D Gaussians."""
     steps: int | None = None
     """Steps of refinement; those of beags-refine if left out."""
     overwrite: bool = False
@@ -161,7 +159,7 @@ class Render:
     output: Annotated[Path | None, OUTPUT] = None
     """The file (with --underlay the folder); in renders/ beside config.yml if left out."""
     data: Path | None = None
-    """Folder of the photos, whose cameras say what is up, if not where the run was trained on them."""
+    """Folder of the photos, if they were moved; their cameras tell which way is up."""
     pictures: tyro.conf.OmitArgPrefixes[RenderOptions] = RenderOptions()
 
     def run(self) -> None:
@@ -174,7 +172,7 @@ class Render:
             path = render_run(
                 self.load_config, self.object, self.format, self.output, self.pictures, progress, self.data
             )
-        CONSOLE.print(f"{self.format}: {path}", markup=False)
+        CONSOLE.print(f"{self.format}: {path}")
 
     def _underlay(self) -> None:
         if self.format != "video" or self.pictures != RenderOptions():
@@ -188,8 +186,7 @@ class Render:
             made = write_underlays(self.load_config, self.object, self.output, progress, self.data)
         CONSOLE.print(
             f"underlay: {made.count} pictures in {made.folder}\n  Fill each object white on a black layer over them, "
-            f"parts that others hide too; save it as\n  {made.silhouettes}/<object>/<photo>.png; beags eval reads it.",
-            markup=False,
+            f"parts that others hide too; save it as\n  {made.silhouettes}/<object>/<photo>.png; beags eval reads it."
         )
 
 
@@ -203,15 +200,15 @@ class Eval:
     load_config: tuple[Path, ...]
     """One trained run or more: folders, or config.yml in them."""
     data_set_name: str = "mean"
-    """What the mean of several runs is called."""
+    """Name of the mean over several runs."""
     json: Path | None = None
     """File for all figures, down to single masks and views."""
     csv: Path | None = None
     """File for the figures of objects and scenes as a table."""
     picture: Path | None = None
-    """File for a picture of the worst masks: what is right, missed and wrong, before and after."""
+    """File for a picture of the worst masks: right, missed and wrong pixels, before and after."""
     worst: int = 6
-    """How many masks of each kind the picture shows."""
+    """Number of masks of each kind in the picture."""
     data: Path | None = None
     """Folder of the photos, if not where the run was trained on them."""
     protocol: tyro.conf.OmitArgPrefixes[Protocol] = Protocol()

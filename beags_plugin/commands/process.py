@@ -7,21 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from rich.console import Console
-
+from beags_plugin.commands.answers import CONSOLE
 from beags_plugin.commands.starting import starting
 from beags_plugin.system.output_option import OUTPUT_DIR
 from beags_plugin.system.pasted import command
 from beags_plugin.system.progress import progress_bar
-
-CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
 
 
 @dataclass
 class Process:
     """Find the poses of photos or of a video, on the CPU, and write a scene that ns-train reads.
 
-    What was computed is kept in the folder: a second call goes on, also with more photos.
+    Results are kept in the folder: a second call continues, also with more photos.
     """
 
     data: Path
@@ -30,8 +27,8 @@ class Process:
     """Folder to write: images/, transforms.json, sparse_pc.ply, colmap/sparse/0, poses.json, poses.png."""
 
     masks: Path | None = None
-    """Folder of id images <photo>.png: only what objects show is used, for turntables, where they turn and the room
-    stands."""
+    """Folder of id images <photo>.png: only the objects' features are used, for turntables, where objects turn and the
+    room stands still."""
 
     ignore_ids: tuple[int, ...] = ()
     """Ids in these images that mean "unlabelled", e.g. 255."""
@@ -60,7 +57,7 @@ def find_poses(
 ) -> list[str]:
     """Write the poses of photos or a video, and their picture, into ``output``; return lines that report them.
 
-    start: shown while what is needed is imported. masks, ignore_ids: see ``Process``. Raises ``UserError`` as
+    start: entered while modules are imported. masks, ignore_ids: see ``Process``. Raises ``UserError`` as
     ``posing.process.process`` does.
     """
     with start:

@@ -1,4 +1,4 @@
-"""What ``beags demo`` makes of photos before it trains: poses where there are none, masks where there are none."""
+"""Make the scene of ``beags demo`` from photos: poses where there are none, masks where there are none."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from rich.console import Console
-
+from beags_plugin.commands.answers import CONSOLE
 from beags_plugin.commands.made_masks import MADE, SALIENT, ChosenSource, as_made, check_source, made_masks
 from beags_plugin.commands.process import find_poses
 from beags_plugin.data.layout import fitting_layouts, read_dataset
@@ -25,16 +24,16 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
-CONSOLE = Console(soft_wrap=True, highlight=False, markup=False)  # paths may hold brackets
-MADE_OF = "made_of.json"  # in the scene: the path of its photos
-POSES = ("transforms*.json", "cameras.*", "*/cameras.*")  # of a scene that lacks something, not of photos alone
+MADE_OF = "made_of.json"  # In the scene: the path of its photos.
+POSES = ("transforms*.json", "cameras.*", "*/cameras.*")  # Files that only a scene has, even an incomplete one.
 
 
 @dataclass(frozen=True)
 class MadeScene:
-    """A scene to train on: its folder, and the folder that holds masks/ and classes.json if it is another.
+    """A scene to train on.
 
-    turned: the objects turned while the room stood, and the poses are theirs.
+    data: its folder. labels: the folder with masks/ and classes.json, if it is another one. turned: whether the objects
+    turned while the room stood still, and the poses are those of the objects.
     """
 
     data: Path
@@ -55,23 +54,23 @@ class MadeScene:
         return ["--masks-path", str(masks), *(["--classes-path", str(classes)] if classes.exists() else [])]
 
     def digests(self, output: Path) -> list[str]:
-        """Digest the files of the scene, but what the demo wrote into ``output``, where that lies in the scene."""
+        """Return digests of the scene's files, without those that the demo wrote into ``output`` inside the scene."""
         inside = self.data.resolve().is_relative_to(output.resolve())
-        found = [folder_digest(self.data, without=None if inside else output)]
+        digests = [folder_digest(self.data, without=None if inside else output)]
         if self.labels is not None:
             classes = self.labels / "classes.json"
-            found += [folder_digest(self.labels / "masks"), content_digest([classes] if classes.exists() else [])]
-        return found
+            digests += [folder_digest(self.labels / "masks"), content_digest([classes] if classes.exists() else [])]
+        return digests
 
 
 def name_of(data: Path) -> str:
-    """Return what the outputs of a scene, photos or a video are called; ``images`` alone would name nothing."""
+    """Return the name of a scene, photos or a video; a folder ``images`` has the name of its parent."""
     folder = data.resolve()
     return folder.stem if data.is_file() else folder.parent.name if folder.name == "images" else folder.name
 
 
 def object_name(data: Path) -> str:
-    """Return what the one object of photos is called: as their folder or video, where that can name a class."""
+    """Return a name for the one object of photos: that of their folder or video, if it can name a class."""
     name = name_of(data).strip()
     return name if name.isprintable() and name not in ("", "background") and not name.startswith("-") else "object"
 
@@ -80,18 +79,17 @@ def made_scene(data: Path, output: Path, masks: bool = True, chosen: ChosenSourc
     """Return the scene in ``data``, or one made below ``output`` of photos without poses, or without masks.
 
     data: a scene, a folder of photos (or with images/, perhaps masks/), or a video. masks: whether they are needed.
-    chosen: the source of masks where there are none. What an earlier call made of the same photos is taken as it is;
-    masks also where the user has mended them. Raises ``UserError``; where masks cannot be made, before poses are
-    computed.
+    chosen: the source of masks where there are none. Results of an earlier call with the same photos are used again,
+    masks also if the user mended them. Raises ``UserError``; if masks cannot be made, before poses are computed.
     """
     if data.is_dir() and (fitting_layouts(data) or any(any(data.glob(pattern)) for pattern in POSES)):
-        read_dataset(data)  # says what lacks or is too much
+        read_dataset(data)  # It reports what is missing or superfluous.
         if not masks or _has_masks(data):
             _check_needed(chosen, data, masks)
             return MadeScene(data)
         check_source(chosen)
         return MadeScene(data, made_masks(data, output / "made", object_name(data), chosen))
-    found = [] if is_video(data) else find_photos(data)  # says what is wrong with them before anything is fetched
+    photos = [] if is_video(data) else find_photos(data)  # It reports bad photos before anything is downloaded.
     given = data if any((data / "masks").rglob("*.png")) else None
     scene = output / "scene"
     _check_other(data, scene)
@@ -104,8 +102,8 @@ def made_scene(data: Path, output: Path, masks: bool = True, chosen: ChosenSourc
         return MadeScene(scene)
     if given is None:
         check_source(chosen)
-    elif find_spec("pycolmap") is not None:  # else the next step says so
-        with_masks(check_photos(found, scene / "images", progress_bar), given / "masks")
+    elif find_spec("pycolmap") is not None:  # Without it the next step reports that.
+        with_masks(check_photos(photos, scene / "images", progress_bar), given / "masks")
     CONSOLE.print(f"{data} has no poses, so they are computed from the photos.")
     own = None
     try:
@@ -118,11 +116,11 @@ def made_scene(data: Path, output: Path, masks: bool = True, chosen: ChosenSourc
     if own is not None:
         return own
     if given is not None and (scene / MADE).exists():
-        (scene / "classes.json").unlink(missing_ok=True)  # of masks that were made when none were given
+        (scene / "classes.json").unlink(missing_ok=True)  # It belongs to masks made before the user gave some.
     labels = given or made_masks(scene, scene, object_name(data), chosen)
     if objects_seem_turned(scene / MODEL, (labels or scene) / "masks"):
         CONSOLE.print(
-            "The poses explain few of the objects' features, as if the objects had turned before a room that stands: "
+            "The poses explain few of the objects' features, as if the objects had turned while the room stood still: "
             "poses of the objects alone are tried."
         )
         own = _scene_of_objects(scene, output / "turned", given, object_name(data), chosen, room=True)
@@ -139,9 +137,9 @@ def _scene_of_objects(
 ) -> MadeScene | None:
     """Make a scene in ``folder`` with poses from the objects' features alone.
 
-    scene: with the photos. given: the folder that holds the user's masks/. name: of the object. room: whether ``scene``
-    has poses of the whole photos. Returns None, and says why, where the objects show too little for poses, or moved as
-    the room did.
+    scene: its images/ are the photos. given: the folder that holds the user's masks/. name: of the object. room:
+    whether ``scene`` has poses of the whole photos. Returns None, and prints why, if the objects have too few features
+    for poses, or moved with the room.
     """
     labels, photos = given or folder / "labels", scene / "images"
     try:
@@ -154,18 +152,18 @@ def _scene_of_objects(
     posed = json.loads((folder / REPORT).read_text(encoding="utf-8"))
     enough = posed["registered"] >= ENOUGH * posed["photos"]
     if not (poses_are_their_own(folder / MODEL, scene / MODEL, labels / "masks") if room else enough):
-        kept = f"the poses in {scene} stay" if room else "they are not taken"
+        result = f"the poses in {scene} stay" if room else "they are not used"
         CONSOLE.print(
-            f"Those of the objects alone are too few, or no better, so {kept}. If the objects did turn, take more "
-            "photos of them, or put masks of all that turned into masks/ beside the photos."
+            f"The poses of the objects alone are too few, or no better, so {result}. If the objects did turn, take "
+            "more photos of them, or put masks of all that turned into masks/ beside the photos."
         )
         return None
-    CONSOLE.print("Poses and training are of the objects alone, as they turned before a room that stands.")
+    CONSOLE.print("Poses and training use the objects alone, because they turned while the room stood still.")
     return MadeScene(folder, labels, turned=True)
 
 
 def _all_masks(photos: Path, labels: Path, name: str, chosen: ChosenSource, mended: Path | None) -> None:
-    """Make masks of all photos, of held-out ones too, as their poses need them; those in ``mended`` go before."""
+    """Make masks of all photos, because held-out ones need poses too; masks in ``mended`` replace them."""
     made_masks(photos, labels, name, chosen)
     for mask in sorted(mended.glob("*.png")) if mended is not None else ():
         same = labels / "masks" / mask.name
@@ -189,7 +187,7 @@ def _check_other(data: Path, scene: Path) -> None:
 
 
 def _check_needed(chosen: ChosenSource, data: Path, masks: bool) -> None:
-    """Raise ``UserError`` where a source of masks is asked for, although data has some."""
+    """Raise ``UserError`` if a source of masks is chosen although the data have masks."""
     if masks and chosen != SALIENT:
         raise UserError(
             f"{data} has masks already: leave --mask-source out, or replace them by {chosen.command(data)} --overwrite."
@@ -202,4 +200,4 @@ def _has_masks(data: Path) -> bool:
 
     parser = SceneData(DataOptions(data=data))
     masks, folder, _ = parser.mask_files(*parser.posed_views())
-    return any(masks) or any(folder.glob("**/*.png"))  # training says what is wrong with their names
+    return any(masks) or any(folder.glob("**/*.png"))  # Training reports wrong names of masks.

@@ -1,6 +1,7 @@
-"""What every command does first: refuse what can be refused at once, and show that it has begun.
+"""First step of every command: reject wrong arguments at once, and show that the command has begun.
 
-torch and nerfstudio take seconds to import. What is checked here is checked again, whole, by whoever uses it.
+torch and nerfstudio take seconds to import, so only quick checks are made here; the code that uses an argument checks
+it fully.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ from beags_plugin.data import LAYOUTS
 from beags_plugin.export import EXPORTERS
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.masks.sources import MASK_SOURCES
+from beags_plugin.options.run_format import CONFIG_FILE
 from beags_plugin.pictures.options import PictureFormat, RenderOptions
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.reading.text import reason
 from beags_plugin.system.shipped import shipped_names
 
-CONFIG_FILE = "config.yml"
-LARGEST_CONFIG = 1 << 20  # bytes; that of a run has some 20,000
+LARGEST_CONFIG = 1 << 20  # Bytes; a run's config has some 20,000.
 
 
 @contextmanager
@@ -38,12 +39,11 @@ def starting(command: Any) -> Iterator[None]:
 
 
 def check_arguments(command: Any) -> None:
-    """Raise ``UserError`` for a run, scene or name among the fields of a command that cannot be used."""
+    """Raise ``UserError`` for a field of a command that names an unusable run, scene or choice."""
     values = vars(command)
     if load_config := values.get("load_config"):
         single = isinstance(load_config, Path)
-        found = tuple(run_config(path) for path in ([load_config] if single else load_config))
-        command.load_config = found[0] if single else found
+        command.load_config = run_config(load_config) if single else tuple(map(run_config, load_config))
     if (run := values.get("run_folder")) is not None:
         run_config(run)
     if (data := values.get("data")) is not None and not data.exists():
@@ -74,7 +74,7 @@ def run_config(path: Path) -> Path:
     except OSError as error:
         raise UserError(f"{path} cannot be read ({reason(error)}): name the config.yml of a run.") from error
     except (yaml.YAMLError, ValueError, RecursionError):
-        return path  # its reader has a sentence for it
+        return path  # Its reader has an error message for it.
     if root is None or not root.tag.startswith("tag:yaml.org,2002:python/object:"):
         raise UserError(f"{path} is not a run of ns-train beags: name the config.yml of one.")
     return path

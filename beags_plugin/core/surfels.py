@@ -54,6 +54,10 @@ class Surfels:
         """Return the same values, without gradients."""
         return Surfels(**{field.name: getattr(self, field.name).detach() for field in fields(self)})
 
+    def to(self, target: torch.device | torch.dtype | str) -> Surfels:
+        """Return the same values on another device or of another dtype."""
+        return Surfels(**{field.name: getattr(self, field.name).to(target) for field in fields(self)})
+
     def clone(self) -> Surfels:
         """Return a copy in memory of its own, without gradients."""
         return Surfels(**{field.name: getattr(self, field.name).detach().clone() for field in fields(self)})

@@ -31,11 +31,11 @@ class LossInputs:
     labels: [H, W] int32 class ids M' of the view, or IGNORE; None if the view has no mask.
     class_ids: [N] int32, phi; None before assignment.
     grid: the visibility voxel grids; None before refinement.
-    screen_shift: [N, 2], that of the render's ``SurfelInputs``; its gradient says where a base grows. None
+    screen_shift: [N, 2], as in the render's ``SurfelInputs``; its gradient decides where the base grows. None
         while nothing grows.
-    draw: renders other Gaussians than ``render`` shows, with geometry, on black; for losses with a render of their own.
-    members: the Gaussians of each class, or None. A loss then reads ``class_ids``, for which it must wait on a GPU.
-    present: ids of the objects in ``labels``, ascending, or None. A loss then reads ``labels``, likewise.
+    draw: renders any Gaussians with geometry, on black; for losses that need a render besides ``render``.
+    members: the Gaussians of each class. With None a loss sorts ``class_ids`` itself, and waits for the GPU.
+    present: ids of the objects in ``labels``, ascending. With None a loss reads them from ``labels``, and waits too.
     """
 
     step: int
@@ -58,11 +58,11 @@ class Loss(ABC):
     """One term of the training loss; a subclass adds its options as dataclass fields.
 
     weight: factor of the term in the sum.
-    start, stop: the term is active at steps start <= step < stop; with stop None, to the end.
+    start, stop: the term is active at steps start <= step < stop; stop None means the end of training.
     """
 
     needs: ClassVar[frozenset[str]] = frozenset()
-    """What the rasterizer must render for it: any of "geometry", "distortion", "boundary"."""
+    """Images that the rasterizer must render for the loss: any of "geometry", "distortion", "boundary"."""
 
     weight: float = 1.0
     start: int = 0
@@ -78,7 +78,7 @@ class Loss(ABC):
         return self.weight != 0.0 and self.start <= step and (self.stop is None or step < self.stop)
 
     def weighted(self, inputs: LossInputs) -> Tensor:
-        """Return the term times its weight, a scalar; compiled ops scale value and gradients themselves, at no cost."""
+        """Return the term times its weight, a scalar; compiled ops apply the weight themselves, at no cost."""
         value = self.value(inputs)
         return value if self.weight == 1.0 else self.weight * value
 

@@ -9,7 +9,7 @@ from torch import Tensor
 class ClassMembers:
     """The Gaussians of every class.
 
-    class_ids: [N] int. They are read when a class is first asked for, and must not change until then (``current``).
+    class_ids: [N] int. They are sorted at the first call of ``of``, and must not change before it (``current``).
     """
 
     def __init__(self, class_ids: Tensor) -> None:
@@ -18,18 +18,19 @@ class ClassMembers:
         self._spans: dict[int, tuple[int, int]] | None = None
 
     def current(self, class_ids: Tensor) -> bool:
-        """Return whether these are the same ids, unchanged by torch's operations in place.
+        """Return whether ``class_ids`` are the same ids, unchanged.
 
-        torch does not count writes through ``.data`` or numpy."""
+        Writes through ``.data`` or numpy go unnoticed, because torch does not count them.
+        """
         return class_ids is self._source and class_ids._version == self._version
 
     def of(self, class_id: int) -> Tensor:
-        """Return [M] int64, ascending: the places of the class's Gaussians, on the device of the ids."""
+        """Return [M] int64, ascending: the indices of the class's Gaussians, on the device of the ids."""
         if self._spans is None:
             ordered, self._order = torch.sort(self._source, stable=True)
             ids, counts = torch.unique_consecutive(ordered, return_counts=True)
             ends = counts.cumsum(0)
             spans = torch.stack([ids.long(), ends - counts, ends], dim=1).tolist()
-            self._spans = {found: (first, end) for found, first, end in spans}
+            self._spans = {each: (first, end) for each, first, end in spans}
         first, end = self._spans.get(class_id, (0, 0))
         return self._order[first:end]

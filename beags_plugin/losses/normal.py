@@ -20,9 +20,9 @@ from beags_plugin.ops.normal_consistency import normal_consistency
 class NormalConsistencyLoss(Loss):
     """Mean over the inner pixels of A (1 - n . n_depth), with A held constant.
 
-    n is the rendered normal sum w n (not normalised) in camera space. The 2DGS paper has sum w (1 - n . n_depth). As in
-    its authors' program, A is constant, so that the term does not thin out surfaces. Pixels at the border, and those
-    without depth at themselves or at one of their four neighbours, count as 0.
+    n is the rendered normal sum w n (not normalised) in camera space. The 2DGS paper has sum w (1 - n . n_depth). A is
+    constant, as in its authors' code, so that the term does not thin out surfaces. A pixel counts as 0 at the border,
+    and where it or one of its four neighbours has no depth.
     """
 
     needs: ClassVar[frozenset[str]] = frozenset({"geometry"})
@@ -57,8 +57,8 @@ def depth_normals(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     points = depth[..., None] * pixel_rays(camera, depth)
     inner = points[1:-1, 1:-1]
     scale = depth.detach()[1:-1, 1:-1, None]
-    seen = depth > 0
-    known = seen[1:-1, 1:-1] & seen[1:-1, 2:] & seen[1:-1, :-2] & seen[2:, 1:-1] & seen[:-2, 1:-1]
+    solid = depth > 0
+    known = solid[1:-1, 1:-1] & solid[1:-1, 2:] & solid[1:-1, :-2] & solid[2:, 1:-1] & solid[:-2, 1:-1]
     # Dividing by the depth makes the product independent of the scene's scale; the direction stays the same.
     scale = torch.where(known[..., None], scale, 1.0)
     across = (points[1:-1, 2:] - points[1:-1, :-2]) / scale
@@ -67,7 +67,7 @@ def depth_normals(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     normal = torch.where((normal * inner).sum(-1, keepdim=True) > 0, -normal, normal)
     squared = (normal * normal).sum(-1)
     known = known & (squared.detach() > torch.finfo(depth.dtype).tiny)
-    # Where unknown, a constant takes the place before the root, whose gradient at 0 is not finite.
+    # Unknown normals become a constant before the root, because its gradient at 0 is not finite.
     towards = torch.tensor([0.0, 0.0, -1.0], dtype=depth.dtype, device=depth.device)
     normal = torch.where(known[..., None], normal, towards)
     length = torch.where(known, squared, 1.0).sqrt()

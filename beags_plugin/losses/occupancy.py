@@ -17,15 +17,15 @@ from beags_plugin.ops import cuda_extension
 from beags_plugin.ops.occupancy_loss import occupancy_loss
 from beags_plugin.system.errors import UserError
 
-_CHUNK_POINTS = 1 << 16  # points looked up at a time: their temporaries stay in the cache; never changes the result
+_CHUNK_POINTS = 1 << 16  # Points looked up at a time; their temporaries fit into the cache. The result is the same.
 
 
 @dataclass(frozen=True)
 class OccupancyLoss(Loss):
     """L = 1 / (N Z) sum_i sum_r o_i G_i(x_r) Q_i(x_r), Q = 1 where D_occ(x_r, V_phi_i) = 0, else 0 (E9).
 
-    Hidden Gaussians learn too. One with a parameter that is not finite, or with a scale of 0, counts as 0. Memory does
-    not depend on ``samples``. The compiled op computes the loss where it can; the code here is its reference.
+    Hidden Gaussians learn too. A Gaussian counts as 0 if one of its parameters is not finite or a scale is 0. Memory
+    does not depend on ``samples``. The compiled op computes the loss where it can; the code here is its reference.
 
     samples: Z, points in each Gaussian and step, uniform in its disc of radius 3 in (u, v).
     background: share of the weight on the Gaussians of the background: 1 as in the paper, 0 leaves them out.
@@ -58,7 +58,7 @@ class OccupancyLoss(Loss):
         return sum(parts[1:], parts[0]) if parts else self._part(inputs, 0.0, False)
 
     def _part(self, inputs: LossInputs, weight: float, background: bool) -> Tensor:
-        """Return ``weight`` times the loss of the objects, with ``background`` also of the background; same points."""
+        """Return ``weight`` times the loss of the objects; ``background``: of all classes, at the same points."""
         surfels, grid, class_ids = inputs.surfels, inputs.grid, inputs.class_ids
         if grid is None or class_ids is None:
             raise ValueError("the occupancy loss needs class ids and a visibility grid")
@@ -147,7 +147,7 @@ def _sums(
             weight = torch.exp(-0.5 * (u * u + v * v)).masked_fill_(valid, 0.0)
             wu, wv = weight * u, weight * v
             terms = torch.stack([weight, wu, wv, wu * u, wv * v, wu * v], dim=1)  # [z, 6, m]
-            # Determinism: sample after sample, so that no choice of chunks changes the order of the sum.
+            # Determinism: the samples are added one after the other, so the size of chunks does not change the sum.
             for term in terms:
                 total[:, part] += term
     return total

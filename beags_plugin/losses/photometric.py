@@ -17,8 +17,8 @@ from beags_plugin.system.errors import UserError
 WINDOW = 11
 SIGMA = 1.5
 _REACH = WINDOW // 2
-_C1, _C2 = 0.01**2, 0.03**2  # the constants of SSIM for values in 0..1; they keep flat regions from dividing by 0
-_BLOCK = 32  # pixels filtered by one small matrix product; measured best of 16, 32, 64
+_C1, _C2 = 0.01**2, 0.03**2  # SSIM's constants for values in 0..1, which keep flat regions from dividing by 0.
+_BLOCK = 32  # Pixels filtered by one small matrix product; 32 was faster than 16 and 64.
 
 
 @dataclass(frozen=True)
@@ -32,14 +32,14 @@ class PhotometricLoss(Loss):
             raise UserError(f"the photometric loss has ssim_weight = {self.ssim_weight}: it must lie in 0..1.")
 
     def value(self, inputs: LossInputs) -> Tensor:
-        drawn, photo = inputs.render.color, inputs.image.to(inputs.render.color)
-        if _compiled_takes(drawn, photo):
+        rendered, photo = inputs.render.color, inputs.image.to(inputs.render.color)
+        if _compiled_takes(rendered, photo):
             weight = self.ssim_weight
-            return compiled.photometric(drawn, photo, 1.0 - weight, -weight, _C1, _C2, offset=weight)
-        absolute = ordered_mean((drawn - photo).abs())
+            return compiled.photometric(rendered, photo, 1.0 - weight, -weight, _C1, _C2, offset=weight)
+        absolute = ordered_mean((rendered - photo).abs())
         if self.ssim_weight == 0.0:
             return absolute
-        return (1.0 - self.ssim_weight) * absolute + self.ssim_weight * (1.0 - ssim(drawn, photo))
+        return (1.0 - self.ssim_weight) * absolute + self.ssim_weight * (1.0 - ssim(rendered, photo))
 
 
 def ssim(image: Tensor, reference: Tensor) -> Tensor:
@@ -64,7 +64,7 @@ def ssim_map(image: Tensor, reference: Tensor) -> Tensor:
 
 def _similarity(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
     """Return the SSIM of images [C, H, W], per channel and pixel, and the parts that its gradient needs."""
-    # Only the sum of the two variances is needed, so four blurs do for the usual five.
+    # Only the sum of the two variances is needed, so four blurs are enough instead of the usual five.
     m_x, m_y, squares, product = blur(torch.cat([x, y, x * x + y * y, x * y])).chunk(4)
     m_xx_yy, m_xy = m_x * m_x + m_y * m_y, m_x * m_y
     a1, a2 = 2 * m_xy + _C1, 2 * (product - m_xy) + _C2
@@ -79,7 +79,7 @@ def _compiled_takes(image: Tensor, reference: Tensor) -> bool:
 
 
 class _Ssim(torch.autograd.Function):
-    """SSIM with its gradient in closed form: three blurs in the backward instead of what autograd would keep."""
+    """SSIM with its gradient in closed form: three blurs replace the tensors that autograd would store."""
 
     @staticmethod
     def forward(ctx, image: Tensor, reference: Tensor) -> Tensor:
@@ -111,7 +111,7 @@ def blur(maps: Tensor) -> Tensor:
     band = _band(maps.dtype, maps.device)
     span = _BLOCK + 2 * _REACH
 
-    # Columns: all maps under each other, with at least one block of zeros between them.
+    # Columns: the maps lie below each other, with at least one block of zeros between them.
     padded_height = (-(-height // _BLOCK) + 1) * _BLOCK
     column = maps.new_zeros(count * padded_height + 2 * _REACH, width)
     column[: count * padded_height].view(count, padded_height, width)[:, _REACH : _REACH + height] = maps
@@ -119,7 +119,7 @@ def blur(maps: Tensor) -> Tensor:
     windows = column.as_strided((blocks, span, width), (_BLOCK * width, width, 1))
     down = torch.bmm(band.T.expand(blocks, _BLOCK, span), windows).view(count, padded_height, width)[:, :height]
 
-    # Rows: all rows behind each other, likewise.
+    # Rows: all rows lie behind each other, likewise.
     padded_width = (-(-width // _BLOCK) + 1) * _BLOCK
     rows = count * height * padded_width
     row = maps.new_zeros(rows + 2 * _REACH)

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_ROW = 1024  # a whole-tensor sum splits its range by the number of threads; sums of rows never split a row
-_BLOCK, _BLOCKS = 64, 64  # rows of a small product, and the least number of them
+_ROW = 1024  # torch splits the sum of a whole tensor between threads, but never a row of a sum over rows.
+_BLOCK, _BLOCKS = 64, 64  # Rows of a small product, and the least number of products.
 
 
 def ordered_sum(values: Tensor) -> Tensor:
@@ -21,7 +21,7 @@ def ordered_sum(values: Tensor) -> Tensor:
         if missing := -values.numel() % _ROW:
             values = torch.nn.functional.pad(values, (0, missing))
         values = values.view(-1, _ROW).sum(1)
-    return values.sum()  # too few elements to be split
+    return values.sum()  # These are too few elements to be split.
 
 
 def ordered_mean(values: Tensor) -> Tensor:
@@ -32,11 +32,11 @@ def ordered_mean(values: Tensor) -> Tensor:
 def grouped_sums(rows: Tensor, groups: Tensor, count: int) -> Tensor:
     """Return [count, C], the sums of the rows of each group, 0 of none; differentiable.
 
-    They are added in their order and in float64, whatever the number of threads, and are of the rows' dtype.
-    rows: [P, C] float. groups: [P] int, below ``count``. Their gradient is a copy of that of their group.
+    rows: [P, C] float. groups: [P] int, below ``count``. Rows are added in their order and in float64, whatever the
+    number of threads; the sums have the rows' dtype.
     """
     channels = rows.shape[1]
-    # Determinism: of a vector alone, index_add goes one by one.
+    # Determinism: index_add adds one by one only into a vector.
     entries = groups.long()[:, None] * channels + torch.arange(channels, device=rows.device)
     flat = rows.new_zeros(count * channels, dtype=torch.float64)
     return flat.index_add(0, entries.view(-1), rows.double().reshape(-1)).view(count, channels).to(rows.dtype)
@@ -58,12 +58,12 @@ def ordered_outer_sum(first: Tensor, second: Tensor) -> Tensor:
     first: [P, A] float. second: [P, B]. Returns [A, B].
     """
     parts = torch.bmm(_blocks(first).transpose(1, 2), _blocks(second))
-    sums = parts.flatten(1).T.contiguous().sum(dim=1)  # a row for each entry, none of which is split
+    sums = parts.flatten(1).T.contiguous().sum(dim=1)  # Each entry is a row, and no row is split.
     return sums.view(first.shape[1], second.shape[1])
 
 
 class _RowProduct(torch.autograd.Function):
-    """rows @ matrix.T by many small products, each of which a thread takes as a whole; a large one would be split."""
+    """rows @ matrix.T as many small products. One thread computes each; torch would split a large product."""
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, matrix: Tensor) -> Tensor:
@@ -73,8 +73,8 @@ class _RowProduct(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         rows, matrix = ctx.saved_tensors
-        of_rows, of_matrix = ctx.needs_input_grad
-        return _times(grad, matrix) if of_rows else None, ordered_outer_sum(grad, rows) if of_matrix else None
+        needs_rows, needs_matrix = ctx.needs_input_grad
+        return _times(grad, matrix) if needs_rows else None, ordered_outer_sum(grad, rows) if needs_matrix else None
 
 
 def _times(rows: Tensor, matrix: Tensor) -> Tensor:
@@ -84,7 +84,7 @@ def _times(rows: Tensor, matrix: Tensor) -> Tensor:
 
 
 def _blocks(rows: Tensor) -> Tensor:
-    """Return [P, A] as [blocks, 64, A], more of them than there are threads, filled up with zeros."""
+    """Return [P, A] as [blocks, 64, A], filled up with zeros; there are more blocks than threads."""
     if missing := max(-len(rows) % _BLOCK, _BLOCK * _BLOCKS - len(rows)):
-        rows = torch.nn.functional.pad(rows, (0, 0, 0, missing))  # which copies even where nothing is missing
+        rows = torch.nn.functional.pad(rows, (0, 0, 0, missing))
     return rows.reshape(-1, _BLOCK, rows.shape[1])

@@ -21,17 +21,17 @@ class LossSpec:
     """One term of the training loss, as a config lists it; presets alone set ``phase`` and ``start``."""
 
     weight: float = 1.0
-    """Factor in the sum; 0 switches the term off."""
+    """Factor of the term in the sum; 0 switches it off."""
     phase: Suppress[Phase] = "both"
-    """Where the term may act."""
+    """Phase in which the term may act."""
     start: Suppress[int] = 0
-    """First step of the term: of the run, stated for a base of schedule_steps; or, for phase "refine", of the
-    refinement, as it is."""
+    """First step of the term: a step of the run, stated for a base of schedule_steps; with phase "refine", a step of
+    the refinement, which is never scaled."""
     options: dict[str, bool | int | float] = field(default_factory=dict)
-    """Of the loss itself. occupancy: samples, points per Gaussian and step (Z); background, the share of the weight on
-    the background's Gaussians, 1 as in the paper. silhouette: objects, how many are rendered each step; seen, of the 27
-    voxels around what another object covers how many seen as the object's own make that pixel not count, 0 for never.
-    """
+    """Options of the loss itself. occupancy: samples, points per Gaussian and step (Z); background, the share of the
+    weight on the background's Gaussians, 1 as in the paper. silhouette: objects, the number rendered in each step;
+    seen, the number of the 27 voxels around a pixel of another object that, seen as the object's own, exempt it; 0:
+    never."""
 
     def build(self, name: str, schedule: PhaseSchedule) -> Loss:
         """Build the loss, with absolute steps; raises ``UserError`` for a wrong value."""
@@ -46,6 +46,6 @@ class LossSpec:
             check_choice(option, known, "option", f" of the loss {name}")
         first = schedule.base_steps + self.start if self.phase == "refine" else schedule.scaled(self.start)
         if self.phase != "refine" and (schedule.base_steps == 0 or schedule.warm):
-            first = 0  # the base was trained elsewhere: its terms have long started
+            first = 0  # The base was trained elsewhere, so its terms have long started.
         last = schedule.base_steps if self.phase == "base" else None
         return kind(weight=self.weight, start=first, stop=last, **self.options)

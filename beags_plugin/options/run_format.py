@@ -5,12 +5,12 @@ from __future__ import annotations
 from beags_plugin.system.errors import UserError
 
 CONFIG_FILE = "config.yml"
-"""File of a run: its config."""
+"""Name of a run's config file."""
 RUN_FORMAT = 3
 """Written to config.yml; a run of another version is refused."""
 
 
-def other_format(run: object, found: object = None) -> UserError:
-    """Return the error for a run of another version than ours. run: its config.yml; found: its version, if any."""
-    age = "a newer" if isinstance(found, int) and found > RUN_FORMAT else "an older"
+def other_format(run: object, version: object = None) -> UserError:
+    """Return the error for a run of another version than ours. run: its config.yml. version: the one in it, if any."""
+    age = "a newer" if isinstance(version, int) and version > RUN_FORMAT else "an older"
     return UserError(f"{run} was written by {age} version of beags: train again, or use the version that wrote it.")

@@ -35,7 +35,7 @@ class SceneOptions:
     elsewhere."""
     exposure: Literal["auto", "on", "off"] = "auto"
     """Whether each training photo gets an affine colour transform of its own, learned with the scene, which then has
-    the mean photo's exposure; auto: where points that photos share tell that these differ."""
+    the mean photo's exposure; auto: only if points that several photos show differ in brightness between them."""
     start_from: Path | None = None
     """A trained scene to start from instead of seed points: a splat file (docs/export.md), or a run of splatfacto or
     beags. 3D Gaussians are flattened. base_steps then polish it, without growth."""
@@ -50,12 +50,12 @@ class SceneOptions:
     """Steps of refinement; 0 trains a base only."""
     schedule_steps: Suppress[int] = 30_000
     """Length of base training for which all other steps and intervals of the base are stated; with another base_steps
-    they are scaled in proportion. 0: they are taken as they are."""
+    they are scaled in proportion. 0: they are never scaled."""
     refiner: str = "bea"
     """What happens after class assignment: bea (this method), none (assignment alone), or one that another
     package registers, such as another paper's method (baselines/README.md)."""
     refiner_options: dict[str, bool | int | float | str] = field(default_factory=dict)
-    """Options of the refiner, as names and values in turn."""
+    """Options of the refiner: name, value, name, value, and so on."""
     losses: dict[str, LossSpec] = field(default_factory=dict)
     """The terms of the training loss by name."""
     densify: DensifyConfig = field(default_factory=DensifyConfig)
@@ -66,7 +66,7 @@ class SceneOptions:
     """First and last learning rate of the positions, log-linear, times the scene's extent."""
     base_lr_factor: float = 1.0
     """Factor of all learning rates of the base but that of opacities, for a base that is shorter than the official one;
-    a base that polishes takes none."""
+    a base that polishes ignores it."""
     close_contacts: bool = False
     """After the last step of a refinement by losses: close objects, such as the lid of a box, where other objects hid
     them from every photo. It takes a second or more for each object."""
@@ -99,5 +99,5 @@ class SceneOptions:
 
 
 def fixed_background(config: SceneOptions, device: torch.device | str = "cpu") -> Tensor:
-    """Return the colour [3] behind a scene outside training: that of its training, black for "random"."""
+    """Return the colour [3] behind a scene outside training: the one of its training, black for "random"."""
     return torch.full((3,), 1.0 if config.background_color == "white" else 0.0, device=device)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-POLISH_SCHEDULE_FROM = 0.5  # a base that starts from a trained scene repeats the second half of the base schedule
-REFINE_SCHEDULE_FROM = 0.9  # refinement repeats the learning rates of the last tenth (27,000..30,000) of the base
+POLISH_SCHEDULE_FROM = 0.5  # A base that starts from a trained scene repeats the second half of the schedule.
+REFINE_SCHEDULE_FROM = 0.9  # Refinement repeats the learning rates of the base's last tenth (27,000..30,000).
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class PhaseSchedule:
         return self.base_steps / self.stated_for if self.base_steps > 0 and self.stated_for > 0 else 1.0
 
     def scaled(self, steps: int) -> int:
-        """Scale a stated step (or interval: at least 1) to this run; 0 stays 0, which often means never."""
+        """Scale a stated step (or interval: at least 1) to this run; 0 stays 0."""
         return max(round(steps * self.scale), 1) if steps > 0 else steps
 
     @property
@@ -49,7 +49,7 @@ class PhaseSchedule:
     def progress(self, step: int) -> float:
         """Return the position in the base's learning-rate schedule, 0..1; refinement from 0.9, polish from 0.5.
 
-        While refinement sharpens, it goes from 0.5 to 0.9.
+        While refinement sharpens, the position goes from 0.5 to 0.9.
         """
         if not self.refining(step):
             first = POLISH_SCHEDULE_FROM if self.warm else 0.0

@@ -1,4 +1,4 @@
-"""The module that config.yml of runs of the first format names: refuses them, in nerfstudio's programs too."""
+"""Module that runs of the first format name in config.yml: it rejects them, in nerfstudio's programs too."""
 
 from __future__ import annotations
 

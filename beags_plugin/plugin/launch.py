@@ -28,9 +28,9 @@ def resume(
 ) -> None:
     """Train an interrupted run to its end, in its own folder and with its own config.
 
-    run: its folder, or config.yml in it. device: in place of the config's. check_memory: as in ``BeagsTrainerConfig``.
-    data: if not where they were. Without a checkpoint it starts from the beginning. Raises ``UserError`` for another
-    folder, and a complete run.
+    run: its folder, or config.yml in it. device: replaces the config's. check_memory: as in ``BeagsTrainerConfig``.
+    data: folder of the photos, if they were moved. Without a checkpoint the training starts from the beginning. Raises
+    ``UserError`` for another folder and for a complete run.
     """
     from nerfstudio.scripts.train import launch, train_loop
 
@@ -69,7 +69,7 @@ def resumed_config(run: Path, data: Path | None = None) -> BeagsTrainerConfig:
     check_data(config.data_path, path)
     folder, models = config.get_base_dir(), config.get_checkpoint_dir()
     if not any(models.glob("step-*.ckpt")):
-        say(f"{folder} holds no checkpoint yet: it starts from the beginning.")
+        say(f"{folder} holds no checkpoint yet, so training starts from the beginning.")
         return config
     if (folder / EXTRACTION_FILE).exists() or scene_alone(read_checkpoint(newest_checkpoint(models))):
         raise UserError(
@@ -81,7 +81,7 @@ def resumed_config(run: Path, data: Path | None = None) -> BeagsTrainerConfig:
 
 
 def _complete(run: Callable[[], None], config: BeagsTrainerConfig) -> None:
-    """Run a training; raises the error that ended it early."""
+    """Run a training; raise the error that ended it early."""
     try:
         run()
     except SystemExit as end:
@@ -89,4 +89,4 @@ def _complete(run: Callable[[], None], config: BeagsTrainerConfig) -> None:
             raise end.__cause__ from None
         raise
     if not (config.get_base_dir() / REPORT_FILE).exists():
-        raise KeyboardInterrupt  # nerfstudio prints an interrupt and returns
+        raise KeyboardInterrupt  # Nerfstudio catches an interrupt, prints it and returns.

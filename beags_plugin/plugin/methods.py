@@ -1,7 +1,7 @@
 """The methods that ``ns-train`` lists: one nerfstudio ``MethodSpecification`` per preset.
 
-The entry points in pyproject.toml name attributes of this module, such as ``beags_fast``. Each is made from the file of
-its preset, ``method_configs/beags-fast.toml``, when nerfstudio asks for it.
+The entry points in pyproject.toml name attributes of this module, such as ``beags_fast``. Each is built from the
+preset's file, such as ``method_configs/beags-fast.toml``, when nerfstudio reads the attribute.
 """
 
 from __future__ import annotations

@@ -22,9 +22,8 @@ from beags_plugin.losses.photometric import psnr, ssim
 from beags_plugin.options.scene_options import fixed_background
 from beags_plugin.plugin.training.callbacks import training_callbacks
 from beags_plugin.plugin.training.scene_model import LastRender, SceneModel
-from beags_plugin.plugin.viewer.link import ViewerLink
-from beags_plugin.plugin.viewer.panel import ObjectPanel
-from beags_plugin.plugin.viewer.viewing import Viewing, asked_by_viewer, scene_outputs
+from beags_plugin.plugin.viewer.panel import ObjectPanel, ViewerLink
+from beags_plugin.plugin.viewer.viewing import Viewing, called_by_viewer, scene_outputs
 from beags_plugin.rasterizers.interface import RasterOutputs, SurfelInputs
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.system.devices import to_device_async
@@ -37,7 +36,7 @@ class BeagsModel(SceneModel):
 
     def populate_modules(self) -> None:
         """Build the Gaussians from the seed points of the data."""
-        Model.populate_modules(self)  # not SplatfactoModel's: that one loads weights and calls .cuda()
+        Model.populate_modules(self)  # SplatfactoModel's would load weights and call .cuda().
         self.collider = None
         if self.seed_points is None:
             raise ValueError("the data supplies no seed points; use the data parser beags-data, which always does")
@@ -48,11 +47,11 @@ class BeagsModel(SceneModel):
         self.hold(initial_surfels(points, colors / 255.0, self.config.sh_degree, generator), classes)
         self._members: ClassMembers | None = None
         self.viewing = Viewing(self)
-        self.viewer_panel = ObjectPanel(self.viewing)  # nerfstudio finds both by being public attributes
+        self.viewer_panel = ObjectPanel(self.viewing)  # Nerfstudio looks for both among the public attributes.
         self.viewer_link = ViewerLink(self.viewer_panel)
 
     def update_to_step(self, step: int) -> None:
-        """Take the step of a checkpoint before it is loaded."""
+        """Set the step to that of a checkpoint before it is loaded."""
         self.step = step
 
     # -- rendering ---------------------------------------------------------------------------------------------------
@@ -63,17 +62,17 @@ class BeagsModel(SceneModel):
             return self._training_outputs(camera)
         with torch.no_grad():
             view = camera_from_nerfstudio(camera, 0).to(self.device)
-            return self.viewing.outputs(view) if asked_by_viewer() else scene_outputs(self, view)
+            return self.viewing.outputs(view) if called_by_viewer() else scene_outputs(self, view)
 
     def _training_outputs(self, cameras: Cameras) -> dict[str, Any]:
         self.clock.mark("data")
         metadata = cameras.metadata or {}
-        known = metadata.get("camera")  # whose numbers the host has too
-        camera = known or camera_from_nerfstudio(cameras, 0).to(self.device)
+        # The data manager's camera has its numbers on the host too.
+        camera = metadata.get("camera") or camera_from_nerfstudio(cameras, 0).to(self.device)
         needs = frozenset().union(*(loss.needs for loss in self.active_losses().values()))
         labels = metadata.get("labels")
         against = labels if "boundary" in needs else None
-        # behind objects alone, a colour that no Gaussian can learn
+        # Behind objects alone the colour is random, so that no Gaussian can learn it.
         background = self._training_background(random=metadata.get("objects_alone", False))
         class_ids = None if against is None else self.class_ids
         inputs = surfel_inputs(self.surfels(), camera, self.active_sh_degree(), class_ids)
@@ -96,7 +95,7 @@ class BeagsModel(SceneModel):
         return fixed_background(self.config, self.device)
 
     def set_background(self, background_color: Tensor) -> None:
-        """Take the viewer's background [3], for its pictures alone."""
+        """Set the background [3] of the viewer's pictures."""
         self.viewing.background = background_color
 
     # -- losses and metrics --------------------------------------------------------------------------------------------
@@ -104,7 +103,7 @@ class BeagsModel(SceneModel):
     def _truth(self, batch: dict[str, Any], background: Tensor) -> Tensor:
         """Return the photograph [H, W, 3], with the background behind what is transparent."""
         image = self.get_gt_img(batch["image"])
-        if "alpha" in batch:  # it comes on black
+        if "alpha" in batch:  # The image lies on black.
             image = image + (1.0 - self.get_gt_img(batch["alpha"])[..., None]) * background
         return image
 
@@ -147,13 +146,13 @@ class BeagsModel(SceneModel):
             present=batch.get("present"),
         )
 
-        def listed() -> dict[str, Tensor]:
+        def base_terms() -> dict[str, Tensor]:
             return {name: loss.weighted(inputs) for name, loss in self.active_losses().items()}
 
         own, step = self.own_training, self.step - self.schedule.base_steps
-        terms = listed() if own is None else own.terms(inputs, step, listed)
+        terms = base_terms() if own is None else own.terms(inputs, step, base_terms)
         self.clock.mark("losses")
-        # a frozen scene still needs something to call backward on; no parameter hangs on it, so none moves
+        # A frozen scene still needs a loss to call backward on; no parameter depends on this one.
         return terms or {"none": torch.zeros((), device=self.device, requires_grad=True)}
 
     def _draw_apart(self, inputs: SurfelInputs, camera: Camera) -> RasterOutputs:
@@ -170,7 +169,7 @@ class BeagsModel(SceneModel):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Return PSNR and SSIM of an evaluation view, and pictures for tensorboard.
 
-        Of a scene with exposures of its photos also ``psnr_fit``, PSNR after the affine colour fit of the view.
+        If the scene has exposures, also ``psnr_fit``: PSNR after the affine colour fit of the view.
         """
         image = self._truth(batch, outputs["background"])
         metrics = {"psnr": float(psnr(outputs["rgb"], image)), "ssim": float(ssim(outputs["rgb"], image))}

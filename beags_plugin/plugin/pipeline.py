@@ -12,7 +12,7 @@ from beags_plugin.system.errors import print_user_errors_plainly
 
 
 class BeagsPipeline(VanillaPipeline):
-    """``VanillaPipeline``, which tells its data manager whether a base begins, and prints user errors plainly."""
+    """``VanillaPipeline`` that tells its data manager whether a base begins, and prints user errors as sentences."""
 
     def __init__(
         self,

@@ -27,12 +27,7 @@ FIRST_OPTIONS = {
     "beags-data --ignore-ids ID ...": 'ids in the masks that mean "not labelled"',
     "beags-data --downscale-factor 2": "smaller photos: less time, less detail",
 }
-"""The options that people set first, with their use; those of beags-data stand at the end of the command."""
-
-
-def preset_folder() -> Path:
-    """Return the folder of the preset files."""
-    return shipped_folder("method_configs")
+"""The options that people set first, with their use; options of beags-data go to the end of the command."""
 
 
 def preset_names() -> list[str]:
@@ -43,9 +38,9 @@ def preset_names() -> list[str]:
 def load_preset(name: str, folder: Path | None = None) -> MethodSpecification:
     """Return the method of ``<folder>/<name>.toml``.
 
-    The file has a ``description``, a table ``[overrides]`` of dotted config keys, and with ``like`` the name of the
-    preset whose overrides come before its own. Raises ``UserError`` for a file that cannot be read, for a key that the
-    base config does not have, and for presets that are like each other.
+    The file has a ``description``, a table ``[overrides]`` of dotted config keys, and perhaps ``like``, the name of a
+    preset whose overrides apply first. Raises ``UserError`` for a file that cannot be read, for a key that the base
+    config does not have, and for presets that are like each other.
     """
     files = preset_files(name, folder)
     config = base_config()
@@ -57,12 +52,12 @@ def load_preset(name: str, folder: Path | None = None) -> MethodSpecification:
 
 
 def preset_files(name: str, folder: Path | None = None) -> list[Path]:
-    """Return the files that decide a preset: its own, that of the preset it is like, and so on."""
+    """Return the files that make up a preset: its own, that of the preset it is like, and so on."""
     files: list[Path] = []
     while name:
-        path = (folder or preset_folder()) / f"{name}.toml"
+        path = (folder or shipped_folder("method_configs")) / f"{name}.toml"
         if path in files:
-            raise UserError(f"the preset {files[0]} is like itself by way of {files[-1]}: take a like away.")
+            raise UserError(f"the preset {files[0]} is like itself through {files[-1]}: remove one entry like.")
         files.append(path)
         name = _read(path).get("like", "")
     return files
@@ -78,7 +73,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _description(name: str, sentence: str) -> str:
-    """Return the text above the help of ``ns-train <name>``: for beags the first options, else where they are."""
+    """Return the text above the help of ``ns-train <name>``; only that of beags lists the first options."""
     if name != "beags":
         return f"{sentence} The options that matter: ns-train beags --help."
     rows = (f"  {option:<40}{use}" for option, use in FIRST_OPTIONS.items())

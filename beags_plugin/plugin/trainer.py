@@ -1,4 +1,4 @@
-"""The trainer: nerfstudio's, with schedules that end when they should and checkpoints that survive a crash."""
+"""The trainer: nerfstudio's, with a schedule of two phases, checkpoints that survive a crash, and clear errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from filelock import BaseFileLock
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import profiler, writer
 from nerfstudio.utils.decorators import check_main_thread
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.importers.base import find_importer
 from beags_plugin.objects.clean import decide
@@ -38,6 +37,7 @@ from beags_plugin.system.interrupts import Interrupts, stop
 from beags_plugin.system.lock import run_lock
 from beags_plugin.system.memory import peak_memory_mb
 from beags_plugin.system.pasted import quoted
+from beags_plugin.system.progress import say
 from beags_plugin.system.reading.text import reason
 from beags_plugin.system.whole_files import remove_unfinished, write_text_atomically
 
@@ -51,24 +51,24 @@ class BeagsTrainer(Trainer):
         silence_libraries()
         self.schedule = config.model_config.schedule()
         self.config = config
-        self._asked_steps = config.max_num_iterations
+        self._steps_option = config.max_num_iterations
         self.reschedule(self.schedule)
         self.curve: HeldOutCurve | None = None
         self.seconds = StageSeconds()
         self._interrupts = Interrupts(self._go_on)
         self._lock: BaseFileLock | None = None
-        self._before: Rollback | None = None  # the run's folder, until this process has locked it
+        self._before: Rollback | None = None  # The run's folder before this training.
         self._watch = MemoryWatch(config.machine.device_type)
-        self._done = 0  # the last step that was trained
+        self._done = 0  # The last step that was trained.
         self._complete = False
         super().__init__(config, local_rank, world_size)
         self._checkpoints = Checkpoints(config, self.base_dir, self.checkpoint_dir)
 
     def reschedule(self, schedule: PhaseSchedule) -> None:
-        """Take the steps of this run, which some refiners tell from the data."""
+        """Set the steps of this run, which some refiners compute from the data."""
         self.schedule = schedule
-        self.last_step = self._asked_steps or schedule.total
-        self.config.max_num_iterations = self.last_step  # nerfstudio prints percentages of it
+        self.last_step = self._steps_option or schedule.total
+        self.config.max_num_iterations = self.last_step  # Nerfstudio prints percentages of it.
 
     @property
     def _model(self) -> SceneModel:
@@ -86,12 +86,12 @@ class BeagsTrainer(Trainer):
         before = noted(self.base_dir)
         self._lock = run_lock(self.base_dir)
         self._before = before
-        # At once: config.yml is this run's already, and a resume would take both for one run.
+        # config.yml is already this run's, and a resume would take old checkpoints for its own.
         self._checkpoints.set_aside()
         check_machine(self.config.machine)
         self.config.check()
         if (start := self._start()) is not None:
-            find_importer(start)  # before the data are read
+            find_importer(start)  # It raises before the data are read.
         used = any((self.base_dir / self.config.logging.relative_log_dir).glob("events.out.tfevents.*"))
         super().setup(test_mode)
         if self.config.check_memory:
@@ -100,13 +100,13 @@ class BeagsTrainer(Trainer):
             self._forget_events()
 
     def _stop(self, error: BaseException) -> None:
-        """Release the run, whose training ``error`` has ended; end the program with one sentence where there is one.
+        """Release the run after ``error``; exit with one sentence if there is one for it.
 
-        There is one if memory ran out, the system refused a file, or a user can help it. Nothing is left of a training
-        that has saved no checkpoint then.
+        There is one if memory ran out, the system refused a file, or the user made a mistake. A training that has saved
+        no checkpoint then leaves no files.
         """
         self._close_writers(failed=True)
-        profiler.PROFILER.clear()  # whose figures would be printed below the sentence
+        profiler.PROFILER.clear()  # Its figures would be printed below the sentence.
         if (sentence := self._sentence(error)) is None:
             return self._release()
         undone = self._before is not None and self._before.undo()
@@ -124,7 +124,7 @@ class BeagsTrainer(Trainer):
             )
         if not isinstance(error, OSError):
             return None
-        if error.filename is None and is_of_disk(error):  # as of nerfstudio's own writers
+        if error.filename is None and is_of_disk(error):  # Nerfstudio's own writers raise such errors.
             return UserError(
                 f"a file of {self.base_dir}, or a temporary one in {gettempdir()}, cannot be written "
                 f"({error.strerror}): free some space there, or choose other places (--run-dir, TMPDIR)."
@@ -141,17 +141,17 @@ class BeagsTrainer(Trainer):
     def _close_writers(self, failed: bool = False) -> None:
         for each in writer.EVENT_WRITERS:
             if isinstance(each, writer.TensorboardWriter):
-                with suppress(OSError):  # of a full disk, which has been reported
+                with suppress(OSError):  # A full disk has been reported already.
                     each.tb_writer.close()
             if failed and isinstance(each, writer.WandbWriter):
                 import wandb
 
-                wandb.finish(exit_code=1, quiet=True)  # it would print below the sentence
+                wandb.finish(exit_code=1, quiet=True)  # Else it would print below the sentence.
         writer.EVENT_WRITERS.clear()
         writer.EVENT_STORAGE.clear()
 
     def _forget_events(self) -> None:
-        """Drop tensorboard's events of steps that this run does again, or of another run in this folder."""
+        """Drop tensorboard's events of steps that this run repeats, or of another run in this folder."""
         own = self.loaded_run == self.base_dir.absolute()
         for each in writer.EVENT_WRITERS:
             if isinstance(each, writer.TensorboardWriter):
@@ -160,12 +160,12 @@ class BeagsTrainer(Trainer):
                 each.tb_writer = type(each.tb_writer)(log_dir=folder, purge_step=self._start_step if own else 0)
 
     def _start(self) -> Path | None:
-        """Return the scene to start from; None where a checkpoint is loaded instead."""
+        """Return the scene to start from; None if a checkpoint is loaded instead."""
         start = self.config.model_config.start_from
         return None if start is None or self._checkpoints.loads else Path(start)
 
     def setup_optimizers(self) -> SceneOptimizer:
-        """Build the scene's optimizer, after a scene to start from is in place: it holds the parameters it gets."""
+        """Build the scene's optimizer, once a scene to start from has replaced the parameters."""
         if self._start() is not None:
             start_from_scene(self._model, cast(BeagsDataManager, self.pipeline.datamanager), self.base_dir)
         return SceneOptimizer(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._model.clock)
@@ -187,7 +187,7 @@ class BeagsTrainer(Trainer):
         self.keep("seconds", self.seconds)
         if self.config.max_num_iterations == 0:
             if self.loaded_run == self.base_dir.absolute() and not (self.base_dir / REPORT_FILE).exists():
-                return self._write_report()  # killed after its last checkpoint
+                return self._write_report()  # The run was killed after its last checkpoint.
             raise UserError(
                 f"the checkpoint is of a complete run ({self._start_step} steps): nothing is left to train; "
                 "to refine a base, this one or <run>/base/nerfstudio_models, load it with beags-refine."
@@ -198,7 +198,7 @@ class BeagsTrainer(Trainer):
             chosen=self._start_step == 0,
         )
         remove_unfinished(self.base_dir)
-        (self.base_dir / REPORT_FILE).unlink(missing_ok=True)  # it marks the run as complete
+        (self.base_dir / REPORT_FILE).unlink(missing_ok=True)  # It marks a run as complete.
         if self.config.steps_per_held_out > 0:
             datamanager = cast(BeagsDataManager, self.pipeline.datamanager)
             self.curve = HeldOutCurve(
@@ -206,32 +206,31 @@ class BeagsTrainer(Trainer):
             )
             self.keep("held_out", self.curve)
         self.keep("random", GlobalRandom())
-        self._checkpoints.all_are_kept()
+        self._checkpoints.drop_loaded_states()
         try:
             with self._interrupts:
                 super().train()
         except KeyboardInterrupt as interrupt:
-            if (self.base_dir / REPORT_FILE).exists():  # complete: the signal ended what shows it in the browser
+            if (self.base_dir / REPORT_FILE).exists():  # The signal ended the viewer of a complete run.
                 return
-            message = f"Stopped. To go on: beags resume {quoted(self.base_dir)}"
-            CONSOLE.print(message, highlight=False, markup=False, soft_wrap=True)
+            say(f"Stopped. To continue: beags resume {quoted(self.base_dir)}")
             raise SystemExit(self._interrupts.exit_code) from interrupt
 
     def train_iteration(self, step: int) -> Any:
         """Train one step; after some of them, print how long the run will take, or measure the held-out views."""
         self._estimate.before_step(step - self._start_step)
-        found = super().train_iteration(step)
+        result = super().train_iteration(step)
         self._done = step
         if self.curve is not None:
-            self.curve.after_step(step)  # before the scene grows, from which it needs some steps to recover
+            self.curve.after_step(step)  # A scene that has just grown would need some steps to recover.
             self._model.clock.skip()
-        return found
+        return result
 
     # -- checkpoints -------------------------------------------------------------------------------------------------
 
     @property
     def loaded_run(self) -> Path | None:
-        """The folder of the run that this one resumes; None where nothing was loaded."""
+        """The folder of the run that this one resumes; None if nothing was loaded."""
         return self._checkpoints.loaded_run
 
     def keep(self, name: str, part: Resumable) -> None:
@@ -254,18 +253,18 @@ class BeagsTrainer(Trainer):
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Save all that decides the rest of the run, whole or not at all."""
-        if not self._complete:  # nerfstudio saves at the end too, under a number of its own
+        if not self._complete:  # Nerfstudio saves again at the end, with another step number.
             self._checkpoints.save(step, self.pipeline, self.optimizers, self.grad_scaler)
 
     # -- breaks --------------------------------------------------------------------------------------------------------
 
     def _go_on(self) -> None:
-        """Let a training that the viewer has paused reach its next step, where a signal stops it."""
+        """Let a training that the viewer has paused reach its next step, so that a signal can stop it."""
         if self.training_state == "paused":
             self.training_state = "training"
 
-    def stop_if_asked(self, step: int) -> None:
-        """Save the step before ``step`` and end, if a signal asked for that or memory is running out."""
+    def stop_if_requested(self, step: int) -> None:
+        """Save the step before ``step`` and end, after a signal or if memory is running out."""
         if self._interrupts.signal is not None:
             if step > self._start_step:
                 self._save_once(step - 1)
@@ -279,7 +278,7 @@ class BeagsTrainer(Trainer):
 
     @contextmanager
     def long_stage(self, step: int) -> Iterator[None]:
-        """Save ``step`` and open a long block, which a signal ends at once; a resumed run repeats it."""
+        """Save ``step`` and enclose a long block, which a signal ends at once; a resumed run repeats it."""
         if step >= 0:
             self._save_once(step)
         self._interrupts.at_once = True
@@ -297,7 +296,7 @@ class BeagsTrainer(Trainer):
     # -- the end -------------------------------------------------------------------------------------------------------
 
     def _after_train(self) -> None:
-        self._interrupts.at_once = True  # a viewer may wait for Ctrl-C
+        self._interrupts.at_once = True  # A viewer may wait for Ctrl-C.
         self.save_checkpoint(self._done)
         self._complete = True
         self._write_report()

@@ -1,4 +1,4 @@
-"""Masks of all views that agree in space (``masks.agreement``), and figures on what that changed."""
+"""Make the masks of all views agree in space (``masks.agreement``), and report what that changed."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ from beags_plugin.masks.separate_things import Things, separate, separated_label
 from beags_plugin.preparation.consistent_masks import Stage, translated
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 
-NAMED = 6  # views in a sentence
+NAMED = 6  # Views named in a sentence.
 
 
 @dataclass(frozen=True)
 class AgreementReport:
     """What agreement did to the masks of V views.
 
-    errors: [V], share of what a view or the others call objects on which it contradicts them; None without a mask.
-    overruled: views whose masks are not believed at all, or show nothing. changed, doubtful: [V], shares of pixels with
-    another class than given, and left unlabelled. things: that an object was split into; None where it was not.
+    errors: [V], share on which a view contradicts the others, of the pixels that either calls an object; None without
+    a mask. overruled: views whose masks have no vote, or show nothing. changed, doubtful: [V], shares of pixels that
+    got another class, and that were left unlabelled. things: the parts that one object was split into; None if it was
+    not.
     """
 
     errors: list[float | None]
@@ -43,7 +44,7 @@ class AgreementReport:
         return float(np.mean(known)) if known else 1.0
 
     def to_json(self, names: Sequence[str]) -> dict[str, Any]:
-        """Return plain values; names: of the views."""
+        """Return plain values for JSON; names: of the views."""
         rows = zip(names, self.errors, self.changed, self.doubtful, strict=True)
         return {
             **({} if self.things is None else {"things": asdict(self.things)}),
@@ -59,7 +60,7 @@ class AgreementReport:
         }
 
     def sentence(self, names: Sequence[str] | None = None) -> str:
-        """Return a line for users; names: of the views, to name those that were overruled."""
+        """Return a line for users; with the names of the views it also names the overruled ones."""
         count = sum(error is not None for error in self.errors)
         line = f"the views agree on {100 * self.agreement:.0f} % of what they call an object"
         if self.overruled:
@@ -85,23 +86,23 @@ def agree(
     take: Callable[[int, AgreedMask], None] = lambda view, mask: None,
     things: int = 1,
 ) -> tuple[LabelMaps, AgreementReport]:
-    """Return the labels of V views, class ids, as one decision per Gaussian has them, and what that changed.
+    """Return labels (class ids) of V views that agree with one class per Gaussian, and what that changed.
 
-    known: the classes. take: receives the number of each view and its mask, in ranks of ``known``. things: above 1, the
-    one object is split into at most so many separate things, whose ids are 1, 2, ... Other arguments as of
-    ``masks.agreement``.
+    known: the classes. take: receives the index of each view and its mask, in ranks of ``known``. things: if above 1,
+    the one object is split into at most so many separate things, whose ids are 1, 2, ... The other arguments are those
+    of ``masks.agreement``.
     """
     given = translated(maps, known, known.ranks)
     with stage("Weighing masks") as progress:
-        found = decide(surfels, cameras, given, rasterizer, settings, len(known), progress)
+        agreement = decide(surfels, cameras, given, rasterizer, settings, len(known), progress)
     split = None
     if things > 1:
-        split = separate(found, surfels, things)
+        split = separate(agreement, surfels, things)
         given = LabelMaps(separated_labels(split, surfels, cameras, given, rasterizer, settings))
-        found, known = split.agreement, ClassRanks(torch.arange(split.things.found + 1))
+        agreement, known = split.agreement, ClassRanks(torch.arange(split.things.found + 1))
     ranked, changed, doubtful = LabelMaps(), [], []
     with stage("Drawing agreed masks") as progress:
-        masks = agreed_masks(found, surfels, cameras, given, rasterizer, settings, len(known), reach, photos)
+        masks = agreed_masks(agreement, surfels, cameras, given, rasterizer, settings, len(known), reach, photos)
         for view, mask in enumerate(masks):
             take(view, mask)
             ranked.append(mask.labels)
@@ -109,7 +110,6 @@ def agree(
             doubtful.append(float(mask.doubtful.float().mean()))
             if progress is not None:
                 progress(view + 1, len(cameras))
-    errors = [None if np.isnan(error) else round(float(error), 4) for error in found.errors]
-    things_found = None if split is None else split.things
-    report = AgreementReport(errors, found.silenced, changed, doubtful, things_found)
+    errors = [None if np.isnan(error) else round(float(error), 4) for error in agreement.errors]
+    report = AgreementReport(errors, agreement.silenced, changed, doubtful, None if split is None else split.things)
     return translated(ranked, known, known.class_ids), report

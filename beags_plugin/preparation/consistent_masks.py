@@ -20,9 +20,9 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
 from beags_plugin.system.progress import each_view
 
-AUTO = "auto"  # pairwise up to the two limits, else voxel
-PAIRWISE_PIXELS = 100_000_000  # in all views; pairwise holds 5 bytes for each: 0.5 GB
-PAIRWISE_PAIRS = 10_000_000_000  # of a voting pixel and a view: 7 to 9 ns each on one core at 256 x 192
+AUTO = "auto"  # It stands for pairwise up to the two limits, else for voxel.
+PAIRWISE_PIXELS = 100_000_000  # Pixels of all views; pairwise holds 5 bytes for each, 0.5 GB.
+PAIRWISE_PAIRS = 10_000_000_000  # Pairs of a voting pixel and a view; each takes 7 to 9 ns on one core at 256 x 192.
 
 Stage = Callable[[str], AbstractContextManager[Progress | None]]
 """Opens a named stage and returns its progress callback, such as a progress bar."""
@@ -44,8 +44,8 @@ class ConsistentMasks:
 def chosen_reprojection(name: str, cameras: Sequence[Camera], labels: LabelMaps) -> tuple[str, str | None]:
     """Resolve "auto" for these views, with a line of reasons; any other name is returned with None.
 
-    "auto" is pairwise, which is slightly more exact, if its memory (pixels) and its time (pairs) are small; else voxel,
-    which grows with neither.
+    "auto" is pairwise, which is slightly more exact, as long as its memory (pixels) and its time (pairs) are small;
+    else it is voxel, whose cost grows with neither.
     """
     if name != AUTO:
         return name, None
@@ -79,9 +79,9 @@ def reprojected_masks(
     config,
     progress: Progress | None = None,
 ) -> ConsistentMasks:
-    """Return the labels of all views, voted by the views with masks; voted views are held one at a time.
+    """Return the labels of all views, voted by the views with masks; one voted view is in memory at a time.
 
-    depths: per view [H, W], of the surface, perhaps on disk. config: a ``PreparationConfig`` with a registered
+    depths: per view [H, W], depth of the surface, perhaps on disk. config: a ``PreparationConfig`` with a registered
     reprojection.
     """
     given = translated(masks, known, known.ranks)

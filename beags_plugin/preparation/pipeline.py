@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -32,13 +32,13 @@ from beags_plugin.preparation.consistent_masks import (
     reprojected_masks,
 )
 from beags_plugin.preparation.refiner import AssignedScene, Refiner
-from beags_plugin.preparation.summary import assignment_summary, reprojection_summary
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import check_surface_depth
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.filed_tensors import filed
+from beags_plugin.system.progress import timed
 
-LEAST_K = 10  # nearer neighbours measure the noise of the depth rather than the distance of points
+LEAST_K = 10  # Fewer neighbours would measure the noise of the depth rather than the distance of points.
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,13 @@ class PreparationConfig:
     """How the views' masks are made to agree: pairwise (exact), voxel (quick), auto (the one that fits the number of
     views), none (the masks stay as they are), or a registered one."""
     tau: float = TAU
-    """Of pairwise: a vote counts if its point is visible, |z - depth| <= tau z; inf counts every vote (E5)."""
+    """Tolerance of pairwise: a vote counts if its point is visible, |z - depth| <= tau z; inf counts every vote
+    (E5)."""
     depth: str = "median"
     """Which depth is lifted: median or expected."""
     agree: bool = False
-    """Weigh the views' masks by how far each agrees with the others, and draw them anew where one decision per Gaussian
-    contradicts them: for masks that a network made, whose errors many views share."""
+    """Weigh the views' masks by how far each agrees with the others, and redraw them where one decision per Gaussian
+    contradicts them: for masks that a network made, because many views share its errors."""
     k: int = 2000
     """Neighbours that set the voxel size (E8); more make larger voxels."""
     k_pixels: int = 0
@@ -65,7 +66,7 @@ class PreparationConfig:
         """Raise ``UserError`` for a value that a stage would refuse, hours before that stage."""
         REPROJECTIONS.check(self.reprojection, AUTO, "none")
         if self.reprojection not in (AUTO, "none"):
-            REPROJECTIONS.get(self.reprojection)  # that of another package may not load
+            REPROJECTIONS.get(self.reprojection)  # Another package's may fail to load.
         check_surface_depth(self.depth)
         if not self.tau >= 0:
             raise UserError(f"tau is {self.tau}: it must be 0 or more (inf counts every vote).")
@@ -89,8 +90,8 @@ class Preparation:
     labels, confidence: per training view, see ``ConsistentMasks``.
     assignment: classes of the base.
     grid: the visibility voxel grids, or None if the refiner needs none.
-    members: the objects, where the refiner says more than the classes do.
-    agreement: what making the masks agree changed, where that was asked for.
+    members: the Gaussians of each object, if the refiner decides more than the classes; else None.
+    agreement: what agreement changed in the masks; None if they were not made to agree.
     summary: a line of text per stage. seconds: wall time per stage.
     """
 
@@ -125,8 +126,8 @@ def prepare(
     class_names: id to name with background (0), in any range: the stages work on ranks.
     background_voxels: False drops the voxels of the background, for losses that ignore it.
     scale: units of the scene's frame per unit of the input poses'.
-    Data as large as the photos lies in temporary files: memory grows by compressed labels per view and by voxels. Only
-    "pairwise" reads depth and labels of all views into memory.
+    Depth images lie in temporary files, so memory grows by the compressed labels of a view and by voxels only. The
+    exception is "pairwise", which reads depth and labels of all views into memory.
     Raises ``UserError`` if no mask names an object.
     """
     maps = labels if isinstance(labels, LabelMaps) else LabelMaps(labels)
@@ -138,16 +139,16 @@ def prepare(
 
     agreement = None
     if config.agree:
-        with _timed("agreement", seconds):
+        with timed(seconds, "agreement"):
             maps, agreement = agree(surfels, cameras, maps, known, rasterizer, settings, stage)
         summary.append(f"agreement: {agreement.sentence()}")
-    with _timed("reprojection", seconds):
+    with timed(seconds, "reprojection"):
         masks = _consistent_masks(surfels, cameras, maps, known, rasterizer, settings, config, stage, summary)
-    with _timed("assignment", seconds), stage("Assigning classes") as progress:
+    with timed(seconds, "assignment"), stage("Assigning classes") as progress:
         shares = contributions(surfels, cameras, masks.ranked, rasterizer, settings, len(known), progress=progress)
         shares = replace(shares, classes=known)
         assignment = by_largest(shares)
-    summary.append(assignment_summary(assignment, class_names))
+    summary.append(_assignment_summary(assignment, class_names))
 
     scene = AssignedScene(
         surfels,
@@ -170,8 +171,8 @@ def prepare(
     with stage("Building voxel grids") as progress:
         grid = refiner.build_grid(scene, k, progress)
     if grid is not None:
-        asked = torch.unique(assignment.class_ids)  # classes are fixed: no loss asks about one without Gaussians
-        grid = grid.only(asked if background_voxels else asked[asked != 0])
+        classes = torch.unique(assignment.class_ids)  # Classes are fixed: no loss looks up one without Gaussians.
+        grid = grid.only(classes if background_voxels else classes[classes != 0])
         seconds["voxel grids"] = time.perf_counter() - start
         summary.append(f"voxel grids: voxel size {grid.voxel_size:.4g} (k = {k})")
     start = time.perf_counter()
@@ -181,7 +182,7 @@ def prepare(
 
 
 def check_masks(labels: Iterable[Tensor | None]) -> None:
-    """Raise ``UserError`` if no mask names an object; masks after the first that does are not asked for."""
+    """Raise ``UserError`` if no mask names an object; masks after the first that does are not read."""
     fault = "no training view has a mask"
     for mask in labels:
         if mask is not None:
@@ -194,13 +195,6 @@ def check_masks(labels: Iterable[Tensor | None]) -> None:
     )
 
 
-@contextmanager
-def _timed(name: str, seconds: dict[str, float]) -> Iterator[None]:
-    start = time.perf_counter()
-    yield
-    seconds[name] = time.perf_counter() - start
-
-
 def _consistent_masks(
     surfels, cameras, maps: LabelMaps, known: ClassRanks, rasterizer, settings, config,
     stage: Stage, summary: list[str],
@@ -210,22 +204,43 @@ def _consistent_masks(
         summary.append("reprojection: off, masks used as they are")
         return masks_as_they_are(maps, cameras, known)
     method, why = chosen_reprojection(config.reprojection, cameras, maps)
-    with stage("Rendering depth") as progress:  # as large as all photos in float
+    with stage("Rendering depth") as progress:
         rendered = render_depths(surfels, cameras, rasterizer, settings, config.depth, progress)
         depths = filed(rendered, surfels.means.device)
     with stage("Reprojecting masks") as progress:
         masks = reprojected_masks(depths, cameras, maps, known, replace(config, reprojection=method), progress)
     if why is not None:
         summary.append(why)
-    summary.append(reprojection_summary(maps, masks.labels))
+    summary.append(_reprojection_summary(maps, masks.labels))
     return masks
+
+
+def _reprojection_summary(before: Sequence[Tensor | None], after: Sequence[Tensor]) -> str:
+    """Describe the pixels that reprojection changed."""
+    changed = pixels = filled = 0
+    for old, new in zip(before, after, strict=True):  # The maps are compressed; one view at a time is unpacked.
+        if old is None:
+            filled += 1
+        else:
+            changed, pixels = changed + int((old != new).sum()), pixels + old.numel()
+    return (
+        f"reprojection: {changed} of {pixels} labelled pixels changed ({100 * changed / max(pixels, 1):.2f} %), "
+        f"{filled} views without a mask got one"
+    )
+
+
+def _assignment_summary(assignment: Assignment, class_names: dict[int, str]) -> str:
+    """Describe the number of Gaussians of each class."""
+    counts = torch.bincount(assignment.class_ids.long(), minlength=max(class_names) + 1)
+    per_class = ", ".join(f"{name} {int(counts[index])}" for index, name in sorted(class_names.items()))
+    return f"assignment: Gaussians per class: {per_class}; never seen: {int(assignment.never_seen.sum())}"
 
 
 def known_classes(labels: Sequence[Tensor | None], class_names: dict[int, str]) -> ClassRanks:
     """Rank the named classes and the unnamed ids in labels; raise ``UserError`` for ids above the last named one."""
     named = ClassRanks(torch.tensor(sorted(class_names)))
     if named.trivial:
-        return named  # the stages check the masks
+        return named  # The stages check the masks themselves.
     last = max(class_names)
     present = torch.zeros(last + 1, dtype=torch.bool)
     for index, mask in enumerate(labels):

@@ -27,8 +27,8 @@ class AssignedScene:
     cameras: the training views. labels: per training view M', [H, W] int32.
     num_classes: ids lie below it, perhaps far apart: see ``labels.class_ranks`` for arrays with an entry per class.
     objects: their ids, ascending, without the background.
-    contributions: C of E6, of the base. scale: units of the run's frame per unit of the input poses'.
-    depth: the depth of the surface: see ``rasterizers.rendering.surface_depth``.
+    contributions: C of E6, in the base. scale: units of the run's frame per unit of the input poses'.
+    depth: kind of the surface depth: see ``rasterizers.rendering.surface_depth``.
     stage: opens a progress bar with a title.
     """
 
@@ -51,12 +51,12 @@ class AssignedScene:
 class Refiner:
     """Interface of the refiners: frozen dataclasses, whose fields, all with defaults, are their options.
 
-    As it is, it leaves the base to its classes and trains nothing.
+    This class itself trains nothing: it leaves the base with its assigned classes.
     """
 
     @property
     def trains(self) -> bool:
-        """Return whether the scene is trained on with the losses of the config."""
+        """Return whether refinement trains the scene with the losses of the config."""
         return False
 
     @property
@@ -66,7 +66,7 @@ class Refiner:
 
     @property
     def joins_base(self) -> bool:
-        """Return whether its own training makes the steps of the base too, with ``seed_classes``."""
+        """Return whether ``own_training`` makes the steps of the base too, from ``seed_classes`` on."""
         return False
 
     def check(self, names: Mapping[int, str]) -> None:
@@ -76,22 +76,23 @@ class Refiner:
     def steps(self, asked: int, views: int, objects: int) -> int:
         """Return the number of steps of refinement.
 
-        asked: ``refine_steps``. views: of training. objects: classes but the background.
+        asked: the option ``refine_steps``. views: number of training views. objects: number of classes but the
+        background.
         """
-        return asked if self.trains else 1  # which changes nothing
+        return asked if self.trains else 1  # This one step changes nothing.
 
     def build_grid(self, scene: AssignedScene, k: int, progress: Progress | None = None) -> VisibilityGrid | None:
         """Build the visibility voxel grid of the refiner's losses (``k`` as in E8), or None if they need none."""
         return None
 
     def members(self, scene: AssignedScene) -> Membership | None:
-        """Return which Gaussians belong to which object before any step; None: phi says."""
+        """Return which Gaussians belong to which object before any step; None: their classes phi decide."""
         return None
 
     def seed_classes(self, scene: TrainedScene) -> Tensor:
-        """Return the classes [N] int32 with which a base that it joins begins; those of new Gaussians follow them."""
+        """Return the classes [N] int32 at the start of a base that it joins; new Gaussians inherit them."""
         raise NotImplementedError
 
     def own_training(self, scene: TrainedScene) -> OwnTraining | None:
-        """Return what makes the steps of a refiner that owns its training; None for the others."""
+        """Return the training of a refiner that makes its steps itself; None for the others."""
         return None

@@ -25,9 +25,9 @@ Stage = Callable[[str], Any]
 class TrainedScene:
     """What a refiner that owns its training sees of a run.
 
-    surfels, class_ids: return the scene as it now is, N Gaussians with gradients, and [N] int32, phi.
+    surfels, class_ids: return the present scene, N Gaussians with gradients, and phi, [N] int32.
     cameras, labels: of the V training views; labels per view [H, W] int32. names: class id to name, background (0)
-    included. steps: of the refinement; base_steps: of the base. extent: of the scene, world units. scale: units of the
+    included. steps: of the refinement. base_steps: of the base. extent: of the scene, world units. scale: units of the
     run's frame per unit of the input poses'. stage: opens a progress bar with a title.
     """
 
@@ -46,7 +46,7 @@ class TrainedScene:
     stage: Stage
 
     def generator(self, step: int, purpose: int = 0) -> torch.Generator:
-        """Return a generator seeded by run, step of the refinement and purpose, so that a resumed run draws alike."""
+        """Return a generator seeded by run, step and purpose, so that a resumed run draws the same numbers."""
         return torch.Generator().manual_seed((self.seed * 1_000_003 + self.base_steps + step) * 1_009 + purpose + 1)
 
 
@@ -54,8 +54,8 @@ class TrainedScene:
 class Edit:
     """A change of the scene between two steps.
 
-    edited: the Gaussians in another number, whose classes and Adam moments follow their sources; None leaves them.
-    fresh_adam: Adam starts anew, moments and step count.
+    edited: the Gaussians after the change; classes and Adam moments follow their sources. None leaves them as they are.
+    fresh_adam: whether Adam starts anew, with moments and step count of 0.
     """
 
     edited: Densified | None = None
@@ -63,11 +63,11 @@ class Edit:
 
 
 class OwnTraining(ABC):
-    """Steps of refinement as a refiner makes them; they count from 0, in a base that it joins from -base_steps.
+    """Steps of refinement that a refiner makes itself; they count from 0, and from -base_steps in a base that it joins.
 
-    There it says the terms and rates alone: the scene grows as in any base, and no object is asked for in the end.
+    In the base only ``terms`` and ``rates`` are called: the scene grows as in any base.
 
-    Its state is kept in checkpoints: ``restore(state())`` on a new object with the same scene goes on bit for bit.
+    Checkpoints hold its state: ``restore(state())`` on a new object with the same scene continues bit for bit.
     """
 
     def rates(self, step: int) -> Mapping[str, float] | None:
@@ -95,16 +95,16 @@ class OwnTraining(ABC):
 
     @abstractmethod
     def finish(self) -> Membership | None:
-        """Return the objects, after ``last_edit``; None: phi, as it is, says which they are."""
+        """Return the Gaussians of each object, after ``last_edit``; None: their classes phi decide."""
 
     def figures(self) -> Mapping[str, float]:
-        """Return what the run's report says of this training besides, by name; known once it has finished."""
+        """Return further figures for the run's report, by name; called after ``finish``."""
         return {}
 
     def state(self) -> dict[str, Any]:
-        """Return what decides how it goes on: tensors and plain values."""
+        """Return the state that the next steps depend on: tensors and plain values."""
         return {}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on as the one that gave ``state`` would have."""
+        """Continue from ``state``."""
         return None

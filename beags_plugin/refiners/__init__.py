@@ -36,8 +36,10 @@ def make_refiner(name: str, options: Mapping[str, bool | int | float | str]) -> 
     given: dict[str, bool | int | float | str] = {}
     for option, value in options.items():
         check_choice(option, defaults, "option", f" of the refiner {name}")
-        wanted = type(defaults[option])
-        given[option] = value = str(value) if wanted is str and type(value) is int else value  # a class may be called 7
-        if type(value) is not wanted and not (wanted is float and type(value) is int):
-            raise UserError(f"the option {option} of the refiner {name} is {value!r}: give a {wanted.__name__}.")
+        expected = type(defaults[option])
+        if expected is str and type(value) is int:
+            value = str(value)  # A class may be named 7.
+        if type(value) is not expected and not (expected is float and type(value) is int):
+            raise UserError(f"the option {option} of the refiner {name} is {value!r}: give a {expected.__name__}.")
+        given[option] = value
     return kind(**given)

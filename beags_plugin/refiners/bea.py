@@ -11,7 +11,7 @@ from beags_plugin.preparation.refiner import AssignedScene, Progress, Refiner
 
 @dataclass(frozen=True)
 class BeaRefiner(Refiner):
-    """Trains on with the losses of the refinement phase; classes and number of Gaussians stay fixed."""
+    """Trains the scene with the losses of the refinement phase; classes and number of Gaussians stay fixed."""
 
     @property
     def trains(self) -> bool:

@@ -1,1 +1,1 @@
-"""A run on disk: opened once, each part read when it is first asked for; without nerfstudio."""
+"""A run on disk: opened once, each part read at its first use; without nerfstudio."""

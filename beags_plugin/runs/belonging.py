@@ -1,4 +1,4 @@
-"""Which Gaussians of a run's objects do not belong to them: kept beside its checkpoint once that is decided."""
+"""Which Gaussians of a run's objects do not belong to them: decided once, and stored beside the checkpoint."""
 
 from __future__ import annotations
 
@@ -18,37 +18,37 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.tensors import load_tensors
 from beags_plugin.system.whole_files import write_whole
 
-BELONGING_FILE = "belonging.pt"  # in a run's folder; deleted, what belongs is decided anew
+BELONGING_FILE = "belonging.pt"  # It lies in a run's folder; once deleted, it is made anew.
 RULE = 1
-"""Version of the rule in ``cleaning.clean``: what another one decided is decided anew."""
+"""Version of the rule in ``cleaning.clean``; decisions of another version are made anew."""
 
 
 class Belonging:
-    """What was decided about the objects of a run, for the Gaussians, classes and masks that it has now."""
+    """Decisions about the objects of a run, valid for its present Gaussians, classes and masks."""
 
     def __init__(self, scene: SavedScene, run: Path) -> None:
         self._path = run / BELONGING_FILE
         self._stamp = _stamp(scene, run)
         self._decided: dict[int, dict[str, Any]] = {}
-        with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):  # a damaged file is replaced
-            kept = load_tensors(self._path)
-            if kept["stamp"] == self._stamp:
-                self._decided = {int(class_id): dict(each) for class_id, each in kept["objects"].items()}
+        with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):  # A damaged file is replaced.
+            content = load_tensors(self._path)
+            if content["stamp"] == self._stamp:
+                self._decided = {int(class_id): dict(each) for class_id, each in content["objects"].items()}
 
     def known(self, class_id: int) -> tuple[Tensor, LeftOut] | None:
         """Return the indices [K] int64 of the object's Gaussians in the scene that do not belong to it, and why.
 
         None where that has not been decided.
         """
-        if (found := self._decided.get(class_id)) is None:
+        if (decision := self._decided.get(class_id)) is None:
             return None
-        return found["dropped"], LeftOut(**{name: found[name] for name in asdict(LeftOut())})
+        return decision["dropped"], LeftOut(**{name: decision[name] for name in asdict(LeftOut())})
 
     def keep(self, class_id: int, dropped: Tensor, left_out: LeftOut) -> None:
-        """Keep what was decided about an object; arguments are what ``known`` returns."""
+        """Store the decision about an object; the arguments are what ``known`` returns."""
         self._decided[class_id] = {"dropped": dropped, **asdict(left_out)}
         content = {"stamp": self._stamp, "objects": self._decided}
-        with suppress(OSError, UserError):  # a folder that cannot be written costs time alone
+        with suppress(OSError, UserError):  # Without the file the decision only takes time again.
             write_whole(self._path, lambda file: torch.save(content, file))
 
 

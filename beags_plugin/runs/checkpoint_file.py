@@ -1,4 +1,4 @@
-"""Checkpoint files: read and checked."""
+"""Read checkpoint files and check them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NOT_FLOATS = ("class_ids", "assigned")
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint to the CPU; raises ``UserError`` for a file that is none."""
+    """Read a checkpoint to the CPU; raises ``UserError`` for any other file."""
     try:
         checkpoint = load_tensors(path)
     except FileNotFoundError:
@@ -37,9 +37,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def extra_state(classes: Mapping[int, str], members: Membership, exposures: Exposures | None = None) -> dict[str, Any]:
-    """Return what a model's state holds besides tensors by name: class names, and what classes do not tell.
+    """Return what a model's state holds besides tensors by name: class names, objects and the photos' exposures.
 
-    That is, objects that share Gaussians or lack some, and the photos' exposures.
+    Objects are there only if they share Gaussians or leave some to nobody.
     """
     state: dict[str, Any] = {"classes": dict(classes)}
     if members.objects is not None:
@@ -50,25 +50,25 @@ def extra_state(classes: Mapping[int, str], members: Membership, exposures: Expo
 
 
 def exposures_of(extra: Mapping[str, Any]) -> Exposures | None:
-    """Return the photos' exposures in what ``extra_state`` returned; None where they have one."""
+    """Return the photos' exposures in what ``extra_state`` returned; None if all photos have the same."""
     known = extra.get("exposures")
     return None if known is None else Exposures(tuple(known["names"]), known["affine"])
 
 
 def scene_alone(checkpoint: dict[str, Any]) -> bool:
-    """Return whether the checkpoint has no state of a training, as in ``<run>/base`` and extracted runs."""
+    """Return whether the checkpoint lacks the state of a training, as in ``<run>/base`` and extracted runs."""
     return not checkpoint["optimizers"]
 
 
 def model_state(checkpoint: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Return the model's state in a checkpoint; raises ``UserError`` if it is no scene. path: of its file."""
+    """Return the model's state in a checkpoint; raises ``UserError`` if it is no scene. path: its file."""
     state = {name[7:]: value for name, value in checkpoint["pipeline"].items() if name.startswith("_model.")}
     validate(state, path)
     return state
 
 
 def validate(state: Mapping[str, Any], path: Path) -> None:
-    """Raise ``UserError`` unless ``state`` is that of a ``BeagsModel``. path: of its file."""
+    """Raise ``UserError`` unless ``state`` is the state of a ``BeagsModel``. path: its file."""
     if wrong := _wrong(state):
         raise UserError(f"the checkpoint {path} holds no scene of beags ({wrong}): name another, or train again.")
 
@@ -97,8 +97,8 @@ def _wrong(state: Mapping[str, Any]) -> str | None:
         return "the Gaussians of its objects are not among its own"
     if (known := extra.get("exposures")) is not None and not _is_exposures(known):
         return "the exposures of its photos are damaged"
-    found = set(objects) | set(state["class_ids"].unique().tolist() if bool(state["assigned"]) else [])
-    unnamed = sorted(found - set(names))
+    used = set(objects) | set(state["class_ids"].unique().tolist() if bool(state["assigned"]) else [])
+    unnamed = sorted(used - set(names))
     return f"it gives Gaussians the class {unnamed[0]}, which has no name" if unnamed else None
 
 

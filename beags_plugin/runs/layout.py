@@ -9,11 +9,11 @@ from beags_plugin.system.digests import content_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import load_json, reason
 
-BASE_SNAPSHOT = "base"  # folder with the scene as refinement started from it
-PREPARED = "prepared"  # folder with the masks and grids of refinement
-EXTRACTION_FILE = "extraction.json"  # in a run that holds a part of another: which one, and which part
-REPORT_FILE = "training.json"  # seconds, memory and a refiner's own figures of a run that is complete
-TRANSFORM_FILE = "dataparser_transforms.json"  # nerfstudio's name for the normalisation of the poses
+BASE_SNAPSHOT = "base"  # Folder with the scene that refinement started from.
+PREPARED = "prepared"  # Folder with the masks and grids of refinement.
+EXTRACTION_FILE = "extraction.json"  # An extracted run names here its origin and its object.
+REPORT_FILE = "training.json"  # A complete run has here seconds, memory and a refiner's own figures.
+TRANSFORM_FILE = "dataparser_transforms.json"  # nerfstudio writes the normalisation of the poses here.
 
 
 def newest_checkpoint(folder: Path) -> Path:
@@ -27,21 +27,21 @@ def newest_checkpoint(folder: Path) -> Path:
 
 
 def refinable(models: Path) -> Path:
-    """Return the nerfstudio_models folder that refinement begins at: that of a run's base, if the run keeps one.
+    """Return the nerfstudio_models folder to refine from: that of the run's base if there is one, else ``models``.
 
-    models: the run's own; a refined scene is not refined again.
+    models: the run's own folder. So a refined scene is not refined again.
     """
     base = models.parent / BASE_SNAPSHOT / models.name
     return base if any(base.glob("step-*.ckpt")) else models
 
 
 def preparing_run(run: Path) -> Path:
-    """Return the run that prepared ``run``: itself, or the one that it is the base or an extract of."""
+    """Return the run whose preparation applies to ``run``: itself, or the run of which it is the base or an extract."""
     origin = run / EXTRACTION_FILE
     if origin.exists():
         recorded = Path(_origin(origin, "run", str, "")).parent
         if run.parent.name == "extracted" and (run.parent.parent / "config.yml").exists():
-            recorded = run.parent.parent  # in the usual place; both may have been moved
+            recorded = run.parent.parent  # Both may have been moved together from the recorded place.
         return preparing_run(recorded)
     return run.parent if run.name == BASE_SNAPSHOT and (run.parent / PREPARED).is_dir() else run
 
@@ -49,7 +49,7 @@ def preparing_run(run: Path) -> Path:
 def digest_of_prepared(run: Path) -> str | None:
     """Return a digest of the masks and the grid that refinement of ``run`` was prepared with, if it was.
 
-    Of an extract it is that at the time of the extraction; None if its file has none.
+    For an extract the digest is as old as the extraction; None if its file has none.
     """
     origin = run / EXTRACTION_FILE
     return _origin(origin, "prepared", str, None) if origin.exists() else files_digest(preparing_run(run) / PREPARED)
@@ -58,15 +58,15 @@ def digest_of_prepared(run: Path) -> str | None:
 def _origin(path: Path, name: str, kind: type, absent: Any) -> Any:
     """Read an entry of an extract's file; raises ``UserError`` if the file is damaged."""
     try:
-        found = load_json(path).get(name, absent)
+        value = load_json(path).get(name, absent)
     except (OSError, ValueError, AttributeError) as error:
         raise UserError(f"{path} cannot be read ({reason(error)}): extract the object again.") from error
-    if found is not absent and not isinstance(found, kind) or found == "":
+    if value is not absent and not isinstance(value, kind) or value == "":
         raise UserError(f"{path} has no usable {name!r}: extract the object again.")
-    return found
+    return value
 
 
 def files_digest(folder: Path) -> str:
-    """Return a digest of the masks and the grid in a folder; that of no file if none was prepared there."""
+    """Return a digest of the masks and the grid in a folder; the digest of no files if none was prepared there."""
     whole = (folder / "grid.pt").exists()
     return content_digest([folder / "grid.pt", *sorted((folder / "masks").glob("*.png"))] if whole else [])

@@ -1,4 +1,4 @@
-"""What was picked and corrected in the viewer, beside a run's checkpoint: other classes for the same Gaussians."""
+"""The file of classes that were picked in the viewer, beside a run's checkpoint."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from beags_plugin.system.progress import say
 from beags_plugin.system.reading.tensors import load_tensors
 from beags_plugin.system.whole_files import write_whole
 
-PICKED_FILE = "picked.pt"  # in a run's folder; deleted, the run is as it was trained
+PICKED_FILE = "picked.pt"  # It lies in a run's folder; without it the run has its trained classes.
 
 
 def write_picked(run: Path, means: Tensor, members: Membership, classes: Mapping[int, str]) -> Path:
-    """Keep the classes of a run's Gaussians, whose centres are ``means`` [N, 3], beside its checkpoint."""
+    """Store classes for a run's Gaussians, whose centres are ``means`` [N, 3], beside its checkpoint."""
     path = run / PICKED_FILE
     content = {"gaussians": _digest(means), "class_ids": members.class_ids.cpu().int(), **extra_state(classes, members)}
     write_whole(path, lambda file: torch.save(content, file))
@@ -29,22 +29,22 @@ def write_picked(run: Path, means: Tensor, members: Membership, classes: Mapping
 
 
 def with_picked(state: dict[str, Any], run: Path) -> dict[str, Any]:
-    """Return a model's state with the classes that were picked, if any were for its Gaussians.
+    """Return a model's state with the picked classes, if there are any for its Gaussians.
 
-    What was picked for others, as before the run was trained on, is left alone, and a line says so. Raises
+    A file for other Gaussians, as before the run was trained on, changes nothing, and a line says so. Raises
     ``UserError`` if the file is damaged.
     """
     path = run / PICKED_FILE
     if not path.exists():
         return state
     try:
-        kept = load_tensors(path)
-        if not isinstance(kept, dict):
+        content = load_tensors(path)
+        if not isinstance(content, dict):
             raise ValueError("it holds something else")
-        fits = kept["gaussians"] == _digest(state["gauss_params.means"])
+        fits = content["gaussians"] == _digest(state["gauss_params.means"])
         former = {name: value for name, value in state["_extra_state"].items() if name != "objects"}
-        extra = {**former, **{name: kept[name] for name in ("classes", "objects") if name in kept}}
-        changed = {**state, "class_ids": kept["class_ids"], "assigned": torch.tensor(True), "_extra_state": extra}
+        extra = {**former, **{name: content[name] for name in ("classes", "objects") if name in content}}
+        changed = {**state, "class_ids": content["class_ids"], "assigned": torch.tensor(True), "_extra_state": extra}
     except (OSError, ValueError, KeyError) as error:
         raise UserError(f"{path}, what was picked in the viewer, is damaged ({error}): delete it.") from error
     if not fits:

@@ -15,7 +15,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.labels.classes import read_id_mask, read_mask
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.runs.layout import BASE_SNAPSHOT, PREPARED
+from beags_plugin.runs.layout import PREPARED
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.tensors import load_tensors
 from beags_plugin.system.reading.text import load_json
@@ -38,7 +38,7 @@ def read_grid(path: Path) -> VisibilityGrid | None:
 
 
 def grid_state(path: Path, mmap: bool = False) -> dict[str, Any]:
-    """Read the tensors of a grid; empty without one. mmap: leave them in the file until they are used."""
+    """Read the tensors of a grid; empty without one. mmap: read them only when they are used."""
     try:
         state = load_tensors(path, mmap=mmap)
     except (OSError, ValueError) as error:
@@ -50,8 +50,8 @@ def grid_state(path: Path, mmap: bool = False) -> dict[str, Any]:
 
 
 def _is_grid(state: dict[str, Any]) -> bool:
-    found = [state.get(name) for name in ("voxel_size", "origin", "num_classes", "keys", "classes")]
-    if len(parts := [part for part in found if isinstance(part, Tensor)]) < len(found):
+    values = [state.get(name) for name in ("voxel_size", "origin", "num_classes", "keys", "classes")]
+    if len(parts := [value for value in values if isinstance(value, Tensor)]) < len(values):
         return False
     size, origin, count, keys, classes = parts
     return (
@@ -64,32 +64,30 @@ def _is_grid(state: dict[str, Any]) -> bool:
 
 
 def photos_contradict(run: Path) -> bool:
-    """Return whether a run has found that its photos contradict each other outside the masks, as on a turntable."""
+    """Return whether a run's report says that its photos contradict each other outside the masks, as on a turntable."""
     path = run / PREPARED / PREPARATION_REPORT
     return path.exists() and bool(load_json(path).get("residuals", {}).get("contradict", False))
 
 
-def prepared_labels(path: Path, camera: Camera) -> torch.Tensor:
+def prepared_labels(path: Path, camera: Camera) -> Tensor:
     """Read the labels [H, W] int32 of a prepared mask; raises ``UserError`` if it does not fit the camera."""
     if not path.is_file():
-        raise UserError(
-            f"the prepared mask {path} is missing: restore it, or refine again from base/nerfstudio_models."
-        )
+        raise UserError(f"the prepared mask {path} is missing: {_REMEDY}.")
     labels = torch.from_numpy(read_id_mask(path).astype(np.int32))
     if labels.shape != (camera.height, camera.width):
         raise UserError(
             f"the prepared mask {path} is {labels.shape[1]}x{labels.shape[0]} pixels but its view is "
-            f"{camera.width}x{camera.height}: restore the data, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
+            f"{camera.width}x{camera.height}: restore the data, or refine again from base/nerfstudio_models."
         )
     return labels
 
 
 @dataclass(frozen=True)
 class TrainingMasks:
-    """The masks of one training view, all [h, w] uint16 class ids or IGNORE, of the size that was trained on.
+    """The masks of one training view, all [h, w] uint16 class ids or IGNORE, at the size of the training images.
 
-    photo: the image file. given: of the data; used: after reprojection; exact: the ground truth; None where there is
-    none. confidence: file of the share of the winning votes, may not exist.
+    photo: the image file. given: the data's mask, or None. used: the mask after reprojection. exact: the ground truth,
+    or None. confidence: file of the winner's share of the votes; it may be missing.
     """
 
     name: str
@@ -101,7 +99,7 @@ class TrainingMasks:
 
 
 def training_masks(config: RunConfig) -> list[TrainingMasks]:
-    """Read the masks of every training view of a run that refined; all as in their files, lens distortion included."""
+    """Read the masks of every training view of a run that refined; lens distortion is not removed."""
     outputs = SceneData(replace(config.data_config.dataparser, data=config.data_path)).split("train")
     metadata = outputs.metadata
     exact = (metadata["ground_truth"] or {}).get("masks") or [None] * len(outputs.images)

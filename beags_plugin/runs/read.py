@@ -1,4 +1,4 @@
-"""Reading parts of runs: the trained scene, and the frame it was trained in."""
+"""Read parts of runs: the trained scene, and the frame it was trained in."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from beags_plugin.views.data_options import RunViewOptions
 class SavedScene:
     """A trained run on disk: config, model state (tensors by name), step and class names.
 
-    picked: whether the classes are those picked in the viewer, not those that the run trained.
+    picked: whether the classes were picked in the viewer instead of trained.
     """
 
     config: RunConfig
@@ -45,22 +45,28 @@ class SavedScene:
 
     @property
     def assigned(self) -> bool:
-        """True if the Gaussians have classes."""
+        """Return whether the Gaussians have classes."""
         return bool(self.state["assigned"])
 
     @property
     def members(self) -> Membership:
-        """Which Gaussians belong to which class; all to the background before they have classes."""
+        """Return which Gaussians belong to which class; before they have classes, all belong to the background."""
         return Membership(self.state["class_ids"], self.state["_extra_state"].get("objects"))
 
     @property
     def exposures(self) -> Exposures | None:
-        """Exposures of the training photos; None where they have one."""
+        """Return the exposures of the training photos; None if all have the same."""
         return exposures_of(self.state["_extra_state"])
+
+    @property
+    def settings(self) -> RasterSettings:
+        """Return the depth range."""
+        extent, model = float(self.state["extent"]), self.config.model_config
+        return RasterSettings(model.near * extent, model.far * extent)
 
 
 def read_scene(config: RunConfig, config_path: Path) -> SavedScene:
-    """Read a run's newest checkpoint, with what was picked in the viewer (``runs.picked``).
+    """Read a run's newest checkpoint, with the classes picked in the viewer (``runs.picked``).
 
     Raises ``UserError`` if the run is incomplete or a file is damaged.
     """
@@ -71,15 +77,9 @@ def read_scene(config: RunConfig, config_path: Path) -> SavedScene:
     return SavedScene(config, state, checkpoint["step"], state["_extra_state"]["classes"], state is not trained)
 
 
-def read_run(config_path: Path, data: Path | None = None) -> SavedScene:
-    """Open a run and read its scene alone; data: its data, if not where they were."""
-    return read_scene(open_run(config_path, data), config_path)
-
-
-def raster_settings(scene: SavedScene) -> RasterSettings:
-    """Return the depth range of a saved scene."""
-    extent, model = float(scene.state["extent"]), scene.config.model_config
-    return RasterSettings(model.near * extent, model.far * extent)
+def read_run(config_path: Path) -> SavedScene:
+    """Open a run and read only its scene."""
+    return read_scene(open_run(config_path), config_path)
 
 
 def read_transform(run: Path) -> tuple[Tensor, float] | None:
@@ -96,13 +96,13 @@ def read_transform(run: Path) -> tuple[Tensor, float] | None:
         if transform.shape != (3, 4):
             raise ValueError(f"its transform is {list(transform.shape)}, not [3, 4]")
         if not (bool(transform.isfinite().all()) and 0 < scale < math.inf):
-            raise ValueError("it holds what is no number, or a scale that is not above 0")
+            raise ValueError("it holds NaN or infinity, or a scale that is not above 0")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} cannot be read ({reason(error)}): restore it.") from error
     return transform, scale
 
 
 def view_options(config: RunConfig) -> RunViewOptions:
-    """Return the options of a run's data, with the folder that counts."""
+    """Return the options of a run's views, with the folder in which its data lie now."""
     parser = replace(config.data_config.dataparser, data=config.data_path)
     return replace(config.data_config, dataparser=parser, data=parser.data)

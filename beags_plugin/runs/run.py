@@ -1,4 +1,4 @@
-"""A finished run as one object: opened once and passed down, each part read when it is first asked for."""
+"""A finished run as one object: opened once and passed down, each part read at its first use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
-from beags_plugin.runs.read import SavedScene, raster_settings, read_scene, read_transform, view_options
+from beags_plugin.runs.read import SavedScene, read_scene, read_transform, view_options
 from beags_plugin.runs.relocation import check_data, open_run
 from beags_plugin.runs.run_config import RunConfig
 from beags_plugin.surfaces.frames import Frame
@@ -27,11 +27,11 @@ from beags_plugin.views.scene_data import SceneData
 class Run:
     """A run on disk. Every part raises ``UserError`` if it is missing, damaged, or cannot be read.
 
-    config_path: its config.yml. folder: where that lies.
+    config_path: its config.yml. folder: the folder of that file.
     """
 
     def __init__(self, config_path: Path, data: Path | None = None) -> None:
-        """Name a run; nothing is read yet. data: its photos, if not where they were."""
+        """Name a run; nothing is read yet. data: folder of its photos, if they were moved."""
         self.config_path = config_path
         self.folder = config_path.parent
         self._data = data
@@ -39,17 +39,17 @@ class Run:
 
     @cached_property
     def config(self) -> RunConfig:
-        """The options that it was trained with."""
+        """The options of its training."""
         return open_run(self.config_path, self._data)
 
     @cached_property
     def scene(self) -> SavedScene:
-        """The trained scene, with what was picked in the viewer."""
+        """The trained scene, with the classes picked in the viewer."""
         return read_scene(self.config, self.config_path)
 
     @property
     def assigned(self) -> SavedScene:
-        """The scene, whose Gaussians have classes; raises ``UserError`` for a base without."""
+        """The scene with classes; raises ``UserError`` for a base without."""
         if not self.scene.assigned:
             raise UserError(
                 f"{self.folder} is a base without classes: refine it first "
@@ -59,12 +59,12 @@ class Run:
 
     @cached_property
     def transform(self) -> tuple[Tensor, float] | None:
-        """The data parser's transform ([3, 4] float64, scale); None if the run has no file of it."""
+        """The data parser's transform ([3, 4] float64, scale); None if the run has no such file."""
         return read_transform(self.folder)
 
     @property
     def frame(self) -> Frame:
-        """The frame of the input poses, or the run's own where how it was normalised is not known."""
+        """The frame of the input poses; the run's own if its normalisation is unknown."""
         return Frame.of_run() if self.transform is None else Frame(*self.transform)
 
     @cached_property
@@ -75,14 +75,14 @@ class Run:
     @property
     def settings(self) -> RasterSettings:
         """The depth range of its scene."""
-        return raster_settings(self.scene)
+        return self.scene.settings
 
     @cached_property
     def _data_alone(self) -> SceneData:
         return SceneData(view_options(self.config).dataparser, truth=False)
 
     def views(self, held_out: Literal["val", "test"]) -> RunData:
-        """Return the data that it was trained on; held_out: the split of other views, "test" with exact masks."""
+        """Return its data; held_out: the split of the views that were not trained on, "test" with exact masks."""
         if held_out not in self._splits:
             with self._reading_data():
                 known = self._data_alone if held_out == "val" else None
@@ -91,7 +91,7 @@ class Run:
 
     @cached_property
     def viewpoints(self) -> Viewpoints:
-        """Its training views, in its own frame; no photo is read, and lens distortion stays."""
+        """Its training views in its own frame; no photo is read, and lens distortion is not removed."""
         with self._reading_data():
             cameras = self._data_alone.split("train").cameras
         placed = [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
@@ -99,7 +99,7 @@ class Run:
 
     @contextmanager
     def _reading_data(self) -> Iterator[None]:
-        """Refuse data that are gone, and name the run in errors about them."""
+        """Raise ``UserError`` for missing data, and name the run in errors about them."""
         check_data(self.config.data_path, self.config_path)
         try:
             yield

@@ -1,8 +1,8 @@
-"""config.yml of a run, read without running code that somebody may have written into it.
+"""Read the config.yml of a run without running code that somebody may have written into it.
 
 nerfstudio writes its configs as YAML with Python tags, and its loader calls whatever they name. Here a tag may only
 build dataclasses, enumerations and paths, and name classes, all of known packages. A finished run is read without
-nerfstudio: what it names of it becomes a ``Record``.
+nerfstudio: its classes become ``Record``.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from beags_plugin.views.data_options import DataOptions, RunViewOptions
 
 Config = TypeVar("Config")
 _PATHS = (pathlib.PurePath, pathlib.PosixPath, pathlib.WindowsPath, pathlib.Path, pathlib.PurePosixPath)
-_FUNCTIONS = {"nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate"}  # the only one in nerfstudio's configs
-MOVED = {"beags_plugin.plugin.options.loss_spec.LossSpec": LossSpec}  # older runs name classes so
-_GONE = ("beags_plugin.plugin.options.pyramid.PyramidConfig",)  # options of runs that still open without them
-BEGINNINGS = ("load_dir", "load_checkpoint", "load_config", "load_step")  # what a run was started from
+_FUNCTIONS = {"nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate"}  # Nerfstudio's configs name no other.
+MOVED = {"beags_plugin.plugin.options.loss_spec.LossSpec": LossSpec}  # Older runs name these classes so.
+_GONE = ("beags_plugin.plugin.options.pyramid.PyramidConfig",)  # Options that older runs have.
+BEGINNINGS = ("load_dir", "load_checkpoint", "load_config", "load_step")  # They say what a run was started from.
 _GROUPS = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
 
 
 class Refused(yaml.constructor.ConstructorError):
-    """A tag that a config does not need."""
+    """A tag that no config of ours needs."""
 
 
 class _Older(Exception):
@@ -66,7 +66,7 @@ class RunConfigLoader(yaml.UnsafeLoader):
         raise Refused(None, None, f"it names the module {name}", mark)
 
     def find_python_name(self, name: str, mark: Any, unsafe: bool = False) -> Any:
-        """Return the class that a tag names; a ``Record`` for options that are gone."""
+        """Return the class that a tag names; ``Record`` for options of ``_GONE``."""
         if name in _GONE:
             return Record
         if name in MOVED:
@@ -76,17 +76,17 @@ class RunConfigLoader(yaml.UnsafeLoader):
         if not known and name not in {f"pathlib.{kind.__name__}" for kind in _PATHS}:
             raise Refused(None, None, f"it names {name}, which no run of beags needs", mark)
         try:
-            found = getattr(import_module(module), attribute)
+            target = getattr(import_module(module), attribute)
         except (ImportError, AttributeError, UserError):
             if _package(module) == "beags_plugin":
                 raise _Older from None
             raise Refused(None, None, f"it names {name}, which is not installed", mark) from None
-        if not isinstance(found, type) and name not in _FUNCTIONS:
+        if not isinstance(target, type) and name not in _FUNCTIONS:
             raise Refused(None, None, f"it names {name}, which is no class", mark)
-        own = _package(str(getattr(found, "__module__", "")))
-        if own not in known_packages() | {"torch", "pathlib"}:  # what a known module has imported from elsewhere
+        own = _package(str(getattr(target, "__module__", "")))
+        if own not in known_packages() | {"torch", "pathlib"}:  # A known module may have imported it from elsewhere.
             raise Refused(None, None, f"it names {name}, which no run of beags needs", mark)
-        return found
+        return target
 
     def make_python_instance(
         self, suffix: str, node: Any, args: Any = None, kwds: Any = None, newobj: bool = False, unsafe: bool = False
@@ -100,7 +100,7 @@ class RunConfigLoader(yaml.UnsafeLoader):
                 return kind(args[0])
             if newobj and dataclasses.is_dataclass(kind) and not args:
                 made = kind.__new__(kind)
-                for each in dataclasses.fields(kind):  # those that the run was made without
+                for each in dataclasses.fields(kind):  # An older run may lack some.
                     if each.default_factory is not dataclasses.MISSING:
                         made.__dict__[each.name] = each.default_factory()
                 return made
@@ -122,10 +122,10 @@ class Record:
 
 @dataclass
 class RunConfig:
-    """The config of a finished run, as far as commands need it; without nerfstudio.
+    """The part of a finished run's config that commands need; without nerfstudio.
 
-    pipeline: has the options of the scene, ``model``, and of the data, ``datamanager``. source: the nodes of the YAML,
-    with all that this class leaves out.
+    pipeline: has the options of the scene, ``model``, and of the data, ``datamanager``. source: the nodes of the whole
+    YAML.
     """
 
     pipeline: Any = field(default_factory=Record)
@@ -150,7 +150,7 @@ class RunConfig:
 
     @property
     def data_path(self) -> Path:
-        """The folder (or transforms .json) that the run is trained on: --data, or the data parser's own."""
+        """The folder (or transforms .json) of the training data: --data, or the data parser's own."""
         return Path(self.data_config.data or self.data_config.dataparser.data)
 
     def get_base_dir(self) -> Path:
@@ -164,7 +164,7 @@ class RunConfig:
         return self.get_base_dir() / self.relative_model_dir
 
     def text_in(self, folder: Path) -> str:
-        """Return the config.yml of a run in ``folder`` that is made of this one."""
+        """Return the text of the config.yml of a run in ``folder`` made from this one."""
         assert self.source is not None
         source = deepcopy(self.source)
         views = self.data_config
@@ -181,14 +181,14 @@ _PLAIN: Mapping[str, type] = {
     "beags_plugin.plugin.views.datamanager.BeagsDataManagerConfig": RunViewOptions,
     "beags_plugin.plugin.views.dataparser.BeagsDataParserConfig": DataOptions,
 }
-"""Classes of configs that import nerfstudio, and those that hold the same options without it."""
+"""Names of config classes that import nerfstudio, and the classes that hold the same options without it."""
 
 
 class FinishedRunLoader(RunConfigLoader):
-    """``RunConfigLoader`` that imports no package but this one, and of this one nothing that needs nerfstudio."""
+    """``RunConfigLoader`` that imports neither other packages nor modules of ours that need nerfstudio."""
 
     def find_python_name(self, name: str, mark: Any, unsafe: bool = False) -> Any:
-        """Return the class that stands for the one that a tag names."""
+        """Return the class to use for the class that a tag names."""
         if (plain := _PLAIN.get(name)) is not None:
             return plain
         package = _package(name)
@@ -199,15 +199,15 @@ class FinishedRunLoader(RunConfigLoader):
     def make_python_instance(
         self, suffix: str, node: Any, args: Any = None, kwds: Any = None, newobj: bool = False, unsafe: bool = False
     ) -> Any:
-        """Build as ``RunConfigLoader`` does; a ``Record`` for what is not ours, such as nerfstudio's enumerations."""
+        """Build as ``RunConfigLoader`` does; ``Record`` for other packages' classes, such as enumerations."""
         kind = self.find_python_name(suffix, node.start_mark)
         return Record() if kind is Record else super().make_python_instance(suffix, node, args, kwds, newobj, unsafe)
 
 
 def _only_named(loader: FinishedRunLoader, suffix: str, node: yaml.Node) -> str:
-    """Return a name, such as that of a config's target, as it is: it is not looked up."""
+    """Return a name, such as that of a config's target, without looking it up."""
     if _package(suffix) not in known_packages() and not suffix.startswith("torch.optim."):
-        loader.find_python_name(suffix, node.start_mark)  # refuses it
+        loader.find_python_name(suffix, node.start_mark)  # This raises Refused.
     return suffix
 
 
@@ -248,13 +248,13 @@ def loaded(path: Path, load: Callable[[str], Any], kind: type[Config]) -> Config
         raise UserError(f"{path} is no YAML of a run ({_reason(error)}): restore it, or name another run.") from error
     if not isinstance(config, kind):
         raise UserError(f"{path} is not a run of ns-train beags: name the config.yml of one.")
-    if (found := vars(config).get("run_format")) != RUN_FORMAT:
-        raise other_format(path, found)
+    if (version := vars(config).get("run_format")) != RUN_FORMAT:
+        raise other_format(path, version)
     return config
 
 
 def _drop_gone(node: yaml.Node) -> None:
-    """Drop options that are gone from a config's nodes, in place: nerfstudio's loader would look for their classes."""
+    """Drop the options of ``_GONE`` in place, because nerfstudio's loader would look for their classes."""
     if isinstance(node, yaml.MappingNode):
         node.value = [(key, child) for key, child in node.value if child.tag.rpartition(":")[2] not in _GONE]
         for _, child in node.value:

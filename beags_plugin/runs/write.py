@@ -1,43 +1,30 @@
-"""Writing runs: checkpoints, and run folders on which every ns-* command works."""
+"""Write runs: checkpoints, and run folders on which every ns-* command works."""
 
 from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from beags_plugin.options.run_format import CONFIG_FILE
 from beags_plugin.runs.layout import TRANSFORM_FILE
+from beags_plugin.runs.relocation import AnyConfig
 from beags_plugin.system.whole_files import write_text_atomically, write_whole
-
-
-class Copied(Protocol):
-    """A config of which those of other runs are made: ``RunConfig``, or nerfstudio's."""
-
-    relative_model_dir: Path
-
-    def get_base_dir(self) -> Path:
-        """Return the folder of the run."""
-        ...
-
-    def text_in(self, folder: Path) -> str:
-        """Return the config.yml of a run in ``folder`` that is made of this one."""
-        ...
 
 
 def save_atomically(content: Any, path: Path) -> None:
     """Save by ``torch.save``; the path holds either the old file or the whole new one."""
-    # beside the folder, not in it: nerfstudio takes any file among the checkpoints for one
+    # The unfinished file lies beside the folder, because nerfstudio takes any file in it for a checkpoint.
     write_whole(path, lambda file: torch.save(content, file), path.parent.parent)
 
 
-def write_run(config: Copied, folder: Path, model_state: dict[str, Tensor], step: int) -> Path:
+def write_run(config: AnyConfig, folder: Path, model_state: dict[str, Tensor], step: int) -> Path:
     """Write a run that holds ``model_state`` of a ``BeagsModel``; returns the path of its config.yml.
 
-    config: of the run it comes from. step: of the checkpoint.
+    config: of the run from which it is made. step: of the checkpoint.
     """
     folder = folder.absolute()
     state = {
@@ -47,7 +34,7 @@ def write_run(config: Copied, folder: Path, model_state: dict[str, Tensor], step
     checkpoint = {"step": step, "pipeline": state, "optimizers": {}, "schedulers": {}, "scalers": {}}
     path = folder / config.relative_model_dir / f"step-{step:09d}.ckpt"
     save_atomically(checkpoint, path)
-    for old in path.parent.glob("*.ckpt"):  # of an earlier run into the same folder
+    for old in path.parent.glob("*.ckpt"):  # An earlier run may have been written here.
         if old != path:
             old.unlink()
     config_path = folder / CONFIG_FILE

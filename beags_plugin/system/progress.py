@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from time import monotonic
+from time import monotonic, perf_counter
 from typing import TypeVar
 
 from rich import get_console
@@ -53,9 +53,17 @@ def progress_bar(name: str, passing: bool = False) -> Iterator[Callable[[int, in
             progress.stop()
 
 
-def say(message: str) -> None:
-    """Print a line on the console of the bars, so that it appears above a bar; no markup is read."""
-    get_console().print(message, highlight=False, markup=False, soft_wrap=True)
+@contextmanager
+def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Measure the wall time of the block into ``seconds[name]``."""
+    start = perf_counter()
+    yield
+    seconds[name] = perf_counter() - start
+
+
+def say(message: str, warning: bool = False) -> None:
+    """Print a line as it is, above the bar if one is shown: on the console that bars use. warning: in yellow."""
+    get_console().print(message, style="yellow" if warning else None, highlight=False, markup=False, soft_wrap=True)
 
 
 def counted(items: Iterable[Item], total: int, progress: Callable[[int, int], None]) -> Iterator[Item]:

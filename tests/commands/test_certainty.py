@@ -42,7 +42,7 @@ def write_run(folder: Path, agreement: float | None, overruled: list[str]) -> Pa
 )  # fmt: skip
 def test_the_words_follow_from_what_the_masks_agree_on(tmp_path, agreement, overruled, level):
     found = certainty(write_run(tmp_path / "run", agreement, overruled), tmp_path)
-    assert found.level == level and found.to_json()["level"] == level
+    assert found.level == level
     said = " ".join(found.lines)
     assert (f"How sure: {level}" in said) == (agreement is not None)
     assert ("beags demo --pick --fresh" in said) == (level in ("fairly sure", "not sure"))
@@ -69,7 +69,7 @@ def test_things_told_apart_are_judged_by_their_own_report_and_fewer_are_said(tmp
     (apart / "report.json").write_text(json.dumps({**agreement, "things": {"asked": 3, "found": found, "more": 0}}))
     (apart / "doubt.png").write_bytes(b"drawn")
     judged = certainty(run, tmp_path, None, "beags demo --data x --pick", apart)
-    assert judged.level == "sure" and judged.to_json()["things"]["found"] == found
+    assert judged.level == "sure" and judged.figures["things"]["found"] == found
     sentence = "Only 2 separate things were found, not 3: click on things that touch, or that most masks lack."
     assert (sentence in judged.lines) is said and ("    beags demo --data x --pick --fresh" in judged.lines) is said
     assert write_doubt(run, tmp_path / "doubt.png", apart) and (tmp_path / "doubt.png").read_bytes() == b"drawn"

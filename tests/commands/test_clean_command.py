@@ -41,7 +41,7 @@ def test_a_scene_is_refined_and_written_back_in_its_format(tmp_path, monkeypatch
     assert cleaned.kind == ".spz version 3" and 0 < len(alone.gaussians) < len(cleaned.gaussians)
     found = report["changes"]
     assert (found["before"], found["after"]) == (75, len(cleaned.gaussians))
-    # in the frame of the file that came: what two steps have moved lies near what it was
+    # The result is in the frame of the input file: two steps have hardly moved it.
     before, after = scene.surfels.means, cleaned.gaussians.means
     assert torch.cdist(after, before).amin(dim=1).median() < 0.02
     out = " ".join(capsys.readouterr().out.split())

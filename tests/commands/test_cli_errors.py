@@ -17,7 +17,7 @@ from run_folders import write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
-from beags_plugin.commands import cli, masks, more
+from beags_plugin.commands import cli, masks
 
 RUN = "{tmp}/run/config.yml"
 PRESETS = "beags, beags-base, beags-fast, beags-paper, beags-refine, beags-tiny"
@@ -161,7 +161,7 @@ def test_an_error_prints_this_sentence(folder, monkeypatch, arguments):
 def test_every_subcommand_has_a_sentence():
     words = [arguments.split() for arguments in SENTENCES]
     own = {command.__name__.lower() for command in typing.get_args(cli.Command)}
-    assert {first for first, *_ in words} == own | {*more.COMMANDS.names()}
+    assert {first for first, *_ in words} == own | {*cli.COMMANDS.names()}
     actions = typing.get_args(typing.get_type_hints(masks.Masks)["action"])
     assert {second for first, second, *_ in words if first == "masks"} == {one.__name__.lower() for one in actions}
 
@@ -185,5 +185,5 @@ def test_subcommands_read_alike():
     assert kinds["json"] == {"Path | None"} and kinds["object"] == {"tuple[str, ...]"}
     assert kinds["load_config"] == {"Path", "tuple[Path, ...]"}  # eval takes several
     assert kinds["output"] <= {"Annotated[Path, OUTPUT]", "Annotated[Path | None, OUTPUT]"}
-    assert kinds["objects"] == {"int"}  # of the demo: how many; names are given by object
+    assert kinds["objects"] == {"int"}  # The demo takes a number here; names are given by object.
     assert not {"run", "config", "config_path", "out", "out_dir"} & set(kinds)

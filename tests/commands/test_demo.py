@@ -109,8 +109,8 @@ def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
             demo.run_demo(data, output, "beags-tiny", downscale, 0, fresh)
         return commands[-1], len(commands)
 
-    assert again() == ("ns-train", 1)  # which fails
-    assert again() == ("resume", 2)  # which is killed
+    assert again() == ("ns-train", 1)  # This one fails.
+    assert again() == ("resume", 2)  # This one is killed.
     assert again() == ("resume", 3) and measured == [3]  # then the demo is killed
     assert again() == ("resume", 3) and measured == [3, 3]
     with pytest.raises(UserError, match=r"out/run holds a run that was trained with --downscale 1.0: add --fresh"):

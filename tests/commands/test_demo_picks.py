@@ -110,7 +110,7 @@ def test_things_that_lie_apart_are_told_apart_on_the_base_and_masks_of_them_that
     assert stand.run(True, pick=False, objects=2) == ["apart", "refined", "measured"]
     write_image(stand.output / "apart/masks/v01.png", np.full((60, 100), 7, np.uint8))
     assert stand.run(True, pick=False, objects=3) == ["refined", "measured"]
-    assert "are not as they were made, so they stay" in capsys.readouterr().out
+    assert "were mended, so they stay" in capsys.readouterr().out
 
 
 def test_masks_that_nobody_made_here_hold_no_things_to_tell_apart(stand, tmp_path):
@@ -156,7 +156,7 @@ def test_masks_that_were_mended_after_picking_stay(stand, capsys):
     write_image(stand.output / "pick/masks/v01.png", np.full((60, 100), 1, np.uint8))
     write_image(stand.output / "pick/masks/v02.png", np.full((60, 100), 1, np.uint8))
     assert stand.run(fresh=True) == ["refined", "measured"]
-    assert "are not as they were picked, so they stay" in capsys.readouterr().out
+    assert "were mended, so they stay" in capsys.readouterr().out
 
 
 def test_the_base_of_a_demo_without_picks_is_used_again_and_its_run_is_replaced_only_if_asked_for(stand, monkeypatch):
@@ -172,7 +172,7 @@ def test_the_base_of_a_demo_without_picks_is_used_again_and_its_run_is_replaced_
     with pytest.raises(UserError, match=r"trained with --pick: add --fresh"):
         stand.run(pick=False)
     shutil.rmtree(stand.output / "pick")
-    assert stand.run(fresh=True)[0] == "base"  # that of the picked run is not taken for one without picks
+    assert stand.run(fresh=True)[0] == "base"  # The picked run's base is not reused.
 
 
 @pytest.mark.parametrize(

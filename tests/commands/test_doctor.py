@@ -36,7 +36,7 @@ def test_everything_is_checked(checks):
 
 @pytest.mark.parametrize("module", ["torch", "nerfstudio", "cv2", "open3d"])
 def test_a_missing_package_is_a_finding(monkeypatch, module):
-    monkeypatch.setitem(sys.modules, module, None)  # what makes an import fail
+    monkeypatch.setitem(sys.modules, module, None)  # Importing it then fails.
     name = {"cv2": "opencv"}.get(module, module)
     found = diagnosis._safely(getattr(diagnosis, f"_{name}"))
     assert not found.ok and module in found.sentence
@@ -88,7 +88,7 @@ def test_a_backend_that_kills_its_process_is_a_finding(monkeypatch):
 
 
 def test_an_absent_extension_has_a_repair_and_a_substitute(monkeypatch):
-    hidden = "import sys; sys.modules['beags_plugin._native'] = None\n"  # what makes an import fail
+    hidden = "import sys; sys.modules['beags_plugin._native'] = None\n"  # Importing it then fails.
     monkeypatch.setattr(backends, "TRIAL", hidden + backends.TRIAL)
     found = backends.rasterizer("native")
     assert not found.ok and not found.required and "\n" not in found.sentence

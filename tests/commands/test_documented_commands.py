@@ -21,7 +21,7 @@ from run_folders import write_camera_path, write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
-from beags_plugin.commands import cli, more
+from beags_plugin.commands import cli
 from beags_plugin.splat_io.ply import write_ply
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -120,7 +120,7 @@ def training_config(words: list[str]):
 def check_beags(words: list[str]) -> None:
     name = " ".join(words[:2]) if words[0] == "masks" else words[0]
     if name in RUN and "plane" not in words:  # the clouds of the test's run stand on nothing
-        sized = {"--camera-path", "--underlay"} & set(words)  # which have sizes of their own
+        sized = {"--camera-path", "--underlay"} & set(words)  # These have sizes of their own.
         cli.main([*words, *([] if sized else RUN[name])])
         return
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
@@ -158,7 +158,7 @@ def test_a_documented_command_works(folder, monkeypatch, document, line):
 
 def test_commands_in_the_text_exist():
     """Every `beags NAME` in the text is a subcommand."""
-    known = {command.__name__.lower() for command in typing.get_args(cli.Command)} | {*more.COMMANDS.names()}
+    known = {command.__name__.lower() for command in typing.get_args(cli.Command)} | {*cli.COMMANDS.names()}
     for document in DOCUMENTS:
         named = set(re.findall(r"`beags ([a-z][a-z-]+)", document.read_text("utf8")))
         assert named <= known, f"{document.name}: {named - known}"

@@ -68,7 +68,7 @@ class Reader:
         model.base_steps, model.refine_steps = min(model.base_steps, 20), min(model.refine_steps, 2)
         model.prepare, parser.num_random_points = type(model.prepare)(k=5), 300
         config.optimizers["opacities"]["optimizer"].lr = 0.5  # opaque after so few steps
-        config.data_config.data = config.data or config.data_config.data  # as ns-train does
+        config.data_config.data = config.data or config.data_config.data  # ns-train does the same.
         train(config)
         self.runs.append(config.run_dir)
         return config.run_dir

@@ -195,7 +195,7 @@ def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, 
         "--load-dir", folder / "nerfstudio_models",
         "--pipeline.model.base-steps", 220, "--pipeline.model.refine-steps", 44, "--pipeline.model.prepare.k", 200,
     )  # fmt: skip
-    assert "refinement taken up" in text and "Gaussians per class" not in text
+    assert "refinement continues from" in text and "Gaussians per class" not in text
     before, after = Run(folder / "config.yml").assigned, Run(tmp_path / "resumed" / "config.yml").assigned
     assert after.step == 263 and int(after.state["refined_steps"]) == 44
     assert (before.state["class_ids"] == after.state["class_ids"]).all()

@@ -172,7 +172,7 @@ def test_reprojection_of_a_run_writes_masks_of_the_photos_size(tmp_path, lens, c
     assert all(values.shape == (HEIGHT, WIDTH) and values.max() > 0 for values in confidence)
     for mask, values in zip(masks, confidence, strict=True):
         unlabelled = read_id_mask(mask) == IGNORE
-        assert not values[unlabelled].any()  # where the straight view does not reach, or nothing voted
+        assert not values[unlabelled].any()  # The straight view does not reach these, or nothing voted.
     report = json.loads((tmp_path / "out/report.json").read_text())
     assert report["method"] == "pairwise"
     before = read_id_mask(data / "masks/v01.png")
@@ -192,7 +192,7 @@ def test_the_check_of_a_run_takes_its_options_and_what_replaces_them(tmp_path):
     data = write_scene(tmp_path / "scene")
     config = write_trained(tmp_path / "run", data)
     own = options_beside(config, None)
-    assert own.data == data and own.orientation_method == "none"  # as the run was trained
+    assert own.data == data and own.orientation_method == "none"  # The run was trained with these.
     (data / "masks").rename(data / "others")
     parser = options_beside(config, None, masks_path=Path("others"), ignore_ids=(2,), layout=None)
     assert (parser.layout, parser.orientation_method) == (own.layout, "none")

@@ -7,7 +7,7 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from beags_plugin.commands import cli, more
+from beags_plugin.commands import cli
 from beags_plugin.system import registry
 
 MODULE = '''
@@ -34,7 +34,7 @@ def installed(tmp_path, monkeypatch):
             (tmp_path / f"package_of_{name}.py").write_text(MODULE)
         points = [EntryPoint(name, f"package_of_{name}:Shout", "beags.commands") for name in names]
         monkeypatch.setattr(registry, "entry_points", lambda group: points)
-        monkeypatch.setattr(more, "COMMANDS", registry.Registry("command", "beags.commands", {}))
+        monkeypatch.setattr(cli, "COMMANDS", registry.Registry("command", "beags.commands", {}))
 
     yield install
     for name in [name for name in sys.modules if name.startswith("package_of_")]:
@@ -52,7 +52,7 @@ def test_a_command_of_another_package_runs_and_is_listed(installed, capsys):
 
 
 def test_our_commands_look_for_no_others(monkeypatch):
-    monkeypatch.setattr(more.COMMANDS, "names", None)  # is not called
+    monkeypatch.setattr(cli.COMMANDS, "names", None)  # is not called
     assert cli.all_commands(["export", "--help"]) is cli.Command
 
 

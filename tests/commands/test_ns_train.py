@@ -12,7 +12,7 @@ from places import ROOT
 
 pytest.importorskip("nerfstudio")
 
-from beags_plugin.plugin.views.ns_train import prepare
+from beags_plugin.plugin.views.ns_programs import prepare_training
 
 ENTRY = """
 import atexit, sys
@@ -64,12 +64,12 @@ def test_other_methods_and_programs_are_left_as_they_are(monkeypatch, words):
 
     monkeypatch.setattr(sys, "argv", words)
     before = len(external_methods), misc.torch_compile
-    prepare()
+    prepare_training()
     assert before == (len(external_methods), misc.torch_compile)
 
 
 def test_letters_that_changed_places_are_a_preset_too(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["/bin/ns-train", "begas-fast"])
     with pytest.raises(SystemExit) as end:
-        prepare()
+        prepare_training()
     assert end.value.code == 2 and "did you mean beags-fast?" in capsys.readouterr().err

@@ -42,7 +42,7 @@ SHORT = (
     "--pipeline.model.prepare.k 20 --steps-per-save 20"
 )
 CONFIG = "--load-config outputs/.../config.yml"
-RUN = {  # in this order; the command in README.md: flags that are appended
+RUN = {  # In this order, each command in README.md with the flags to append.
     "beags sample": "--output my_scene --width 64 --height 48 --views 12",
     "beags doctor [--data X]": "--data my_scene",
     "beags masks make --data X --source NAME": "--options folder=masks --output made",
@@ -51,7 +51,7 @@ RUN = {  # in this order; the command in README.md: flags that are appended
     "beags resume RUN": "",  # and so goes on
     f"beags export {CONFIG} --all --format ply glb": "--resolution 24 --output exported",
     "beags masks reproject --load-config C": "",
-    "beags view outputs/...": "",  # until its page is there
+    "beags view outputs/...": "",  # It runs until its page is there.
     f"beags eval {CONFIG} --picture worst.png": "",
     f"beags extract {CONFIG} --object cup": "",
     f"beags render {CONFIG} --object cup --format before-after": "--size 48 --views 2",

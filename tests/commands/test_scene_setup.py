@@ -82,7 +82,7 @@ def test_photos_alone_are_trained_on_with_poses_and_masks_once(photos, tmp_path,
     printed = capsys.readouterr().out
     assert "walk has no poses" in printed and "12 of 12 photos have poses" in printed and "made.png" in printed
     parser = config.data_config.dataparser
-    parser.data = config.data  # as ns-train does
+    parser.data = config.data  # ns-train does the same.
     metadata = parser.setup().get_dataparser_outputs("train").metadata
     assert metadata["classes"] == {0: "background", 1: "walk"}
     for path in metadata["mask_filenames"]:
@@ -93,7 +93,7 @@ def test_photos_alone_are_trained_on_with_poses_and_masks_once(photos, tmp_path,
     monkeypatch.setattr(SalientSource, "make", lambda *_: pytest.fail("made again"))
     demo.run_demo(photos, tmp_path / "out", None, None, 0, False)
     assert len(trainings) == 1 and files(photos) == before
-    write_image(tmp_path / "out/scene/masks/v00.png", np.zeros((240, 320), np.uint8))  # by the user
+    write_image(tmp_path / "out/scene/masks/v00.png", np.zeros((240, 320), np.uint8))  # The user does this.
     with pytest.raises(UserError, match="out/run holds a run that was trained from other data .*--fresh"):
         demo.run_demo(photos, tmp_path / "out", None, None, 0, False)
     assert len(trainings) == 1
@@ -151,7 +151,7 @@ def test_masks_are_made_anew_for_other_photos_unless_they_were_mended(posed, tmp
 
     assert made_of(20) and made_of(40)
     assert "so they stay" not in capsys.readouterr().out
-    write_image(mask, np.zeros((60, 100), np.uint8))  # by the user
+    write_image(mask, np.zeros((60, 100), np.uint8))  # The user does this.
     assert not made_of(20)
     assert "so they stay" in capsys.readouterr().out
 
@@ -295,7 +295,7 @@ def test_other_photos_and_incomplete_scenes_are_refused(photos, tmp_path):
     (tmp_path / "out/scene/made_of.json").write_text('"/elsewhere/walk.mp4"')
     with pytest.raises(UserError, match="was made of /elsewhere/walk.mp4: give another --output"):
         scene_setup.made_scene(photos, tmp_path / "out")
-    (photos / "transforms_train.json").write_text("{}")  # of another program
+    (photos / "transforms_train.json").write_text("{}")  # Another program's file.
     with pytest.raises(UserError, match=r"holds neither transforms\.json"):
         scene_setup.made_scene(photos, tmp_path / "other")
 
@@ -307,16 +307,16 @@ def test_masks_that_were_interrupted_are_made_anew(posed, tmp_path, monkeypatch)
             scene_setup.made_scene(posed, tmp_path / "out")
     mask = tmp_path / "out/made/masks/v01.png"
     assert mask.exists()
-    mask.unlink()  # as if it had not been moved yet
+    mask.unlink()  # It has not been moved yet.
     scene_setup.made_scene(posed, tmp_path / "out")
     assert mask.exists()
 
 
 def test_what_lacks_for_masks_is_said_before_poses_are_computed(photos, tmp_path, monkeypatch):
     monkeypatch.setattr(SalientSource, "unavailable", classmethod(lambda _: "no onnxruntime."))
-    model = photos / "outputs/walk/scene/colmap/sparse/0/cameras.bin"  # of an earlier demo inside the photos' folder
+    model = photos / "outputs/walk/scene/colmap/sparse/0/cameras.bin"  # An earlier demo's file.
     model.parent.mkdir(parents=True)
     model.touch()
-    with pytest.raises(UserError, match=r"none can be made of what stands out: no onnxruntime\."):
+    with pytest.raises(UserError, match=r"the source salient cannot make any: no onnxruntime\."):
         scene_setup.made_scene(photos, tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -62,8 +62,8 @@ def test_poses_of_a_thing_that_turned_are_its_own(tmp_path, network, monkeypatch
     true = write_turntable(tmp_path / "photos")
     made = made_scene(tmp_path / "photos", tmp_path / "out")
     printed = capsys.readouterr().out
-    assert "as if the objects had turned before a room that stands" in printed
-    assert "Poses and training are of the objects alone" in printed
+    assert "as if the objects had turned while the room stood still" in printed
+    assert "Poses and training use the objects alone" in printed
     assert made == MadeScene(tmp_path / "out/turned", tmp_path / "out/turned/labels", turned=True)
     assert (tmp_path / "out/turned/labels/masks/no_truth.json").exists()
     own, room = frames(tmp_path / "out/turned"), frames(tmp_path / "out/scene")
@@ -131,7 +131,7 @@ def test_poses_of_too_few_photos_are_not_taken(tmp_path, room, monkeypatch, caps
     else:
         with pytest.raises(NothingFits):
             made_scene(tmp_path / "photos", tmp_path / "out")
-    assert "Those of the objects alone are too few" in capsys.readouterr().out
+    assert "The poses of the objects alone are too few" in capsys.readouterr().out
 
 
 def test_what_fits_nowhere_is_said_with_what_to_do(tmp_path, network, capsys):

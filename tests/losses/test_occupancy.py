@@ -107,7 +107,7 @@ def test_skipped_gaussians_change_nothing():
     skipped[active] = False
     assert all(not gradient[skipped].any() for gradient in gradients)
     _, invalid = _constants(surfels, grid, _ids(), 500)
-    assert not invalid[:, skipped].any()  # by counting, none of 500 points of a skipped disc is outside
+    assert not invalid[:, skipped].any()  # Counted: none of 500 points of a skipped disc is outside.
 
 
 @both

@@ -153,8 +153,7 @@ def test_a_start_from_exports_is_exact(far, tmp_path, kind, turned):
     """The positions that a run starts from are those of the run that was exported, also after a turn of the axes."""
     from beags_plugin.core.flattening import flatten
     from beags_plugin.importers.base import read_scene
-    from beags_plugin.plugin.training.start_axes import turned_to_fit
-    from beags_plugin.plugin.training.warm_start import _moved, _placed
+    from beags_plugin.plugin.training.warm_start import _moved, _placed, turned_to_fit
     from beags_plugin.runs.read import read_run
 
     if kind.startswith("usd"):

@@ -41,7 +41,7 @@ def files(folder: Path) -> set[Path]:
     return {path.relative_to(folder) for path in folder.rglob("*")}
 
 
-COMMANDS = {  # to what it writes beside config.yml
+COMMANDS = {  # Command to the file that it writes beside config.yml.
     "extract --object box": "extracted/box/box.ply",
     "extract --object cup --remove": "extracted/without_cup/without_cup.ply",
     "export --whole": "exports/whole_scene.ply",
@@ -77,7 +77,7 @@ def test_data_are_found_beside_the_run_too(tmp_path):
     data = write_scene(tmp_path / "far/away/lab")
     run = tmp_path / "there/run"
     shutil.copytree(write_trained(tmp_path / "run", data).parent, run)
-    assert open_run(run / "config.yml").data_path == data  # where it was, while it is there
+    assert open_run(run / "config.yml").data_path == data  # The old place counts as long as the data are there.
     for place in (run.parent / "lab", run / "lab"):
         data = data.rename(place)
         assert open_run(run / "config.yml").data_path == place
@@ -112,7 +112,7 @@ def test_commands_of_nerfstudio_read_and_write_where_the_run_lies(moved, tmp_pat
     cup = moved / "extracted/cup"
     monkeypatch.setattr("sys.argv", ["ns-export", "gaussian-splat", f"--load_config={cup / 'config.yml'}"])
     ExportGaussianSplat(cup / "config.yml", tmp_path / "exported").main()
-    with named(cup / "config.yml"):  # as Python code says it
+    with named(cup / "config.yml"):  # Python code names the file so.
         DatasetRender(load_config=cup / "config.yml", output_path=tmp_path / "pictures").main()
     assert (tmp_path / "exported/splat.ply").exists() and any((tmp_path / "pictures").rglob("*.jpg"))
     assert files(tmp_path / "old") == before
@@ -152,5 +152,5 @@ def test_trainings_go_where_the_run_lies(short_run, tmp_path):
         (run / "config.yml").write_text(re.sub("max_num_iterations: .*", f"max_num_iterations: {steps}", text))
         called(*words)
         assert checkpoint_of(run)["step"] == steps - 1
-        assert open_run(run / "config.yml").data_path == data  # as ns-train has written it
+        assert open_run(run / "config.yml").data_path == data  # ns-train has written this place.
     assert files(short_run) == old and checkpoint_of(short_run / "run")["step"] == 56

@@ -9,7 +9,8 @@ import torch
 from touching_solids import views
 from viser.transforms import SO3
 
-from beags_plugin.plugin.viewer.pointing import WORLD, page_camera
+from beags_plugin.plugin.viewer.aim import WORLD
+from beags_plugin.plugin.viewer.pointing import page_camera
 
 VIEW = views()[3]
 

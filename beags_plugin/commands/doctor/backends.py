@@ -11,7 +11,7 @@ from collections.abc import Callable
 from beags_plugin.commands.doctor.check import Check, first_line
 
 REBUILD = "pip install --force-reinstall --no-deps ."
-"""Builds the compiled backend anew; to run in the folder of the clone."""
+"""Command that rebuilds the compiled backend; it runs in the folder of the clone."""
 
 
 def rasterizers() -> list[Callable[[], Check]]:
@@ -25,7 +25,7 @@ def rasterizers() -> list[Callable[[], Check]]:
 
 
 def rasterizer(name: str) -> Check:
-    """Check a backend by rendering in a process of its own, which may die without ending the doctor."""
+    """Check a backend by rendering in a process of its own, so that a crash does not end the doctor."""
     title, required = f"rasterizer {name}", name == "torch"
     done = subprocess.run(
         [sys.executable, "-c", TRIAL, json.dumps(sys.path), name], capture_output=True, text=True, timeout=120
@@ -44,24 +44,24 @@ def rasterizer(name: str) -> Check:
 
 
 def first_contact_check() -> Check:
-    """Check that the CUDA backend agrees with the torch reference: try it anew, and keep what comes of it."""
+    """Check anew that the CUDA backend agrees with the torch reference, and store the verdict."""
     from beags_plugin.rasterizers import first_contact
 
     name, contact = "CUDA trial", first_contact.this_machine()
     if contact is None:
         return Check(name, False, "none: the CUDA rasterizer cannot run here", False)
-    found = first_contact.verdict(contact, anew=True)
-    if found.reason:
-        return Check(name, False, first_contact.refusal(found), False)
-    return Check(name, True, f"{found.gpus} draws what the torch reference draws ({found.seconds:g} s)", False)
+    verdict = first_contact.verdict(contact, anew=True)
+    if verdict.reason:
+        return Check(name, False, first_contact.refusal(verdict), False)
+    return Check(name, True, f"{verdict.gpus} draws what the torch reference draws ({verdict.seconds:g} s)", False)
 
 
-_AVOIDED = {  # ways to run without a backend that fails
+_AVOIDED = {  # Ways to run without a failing backend.
     "native": "BEAGS_NATIVE=0 in the environment avoids it",
     "cuda": "training with --machine.device-type cpu avoids it",
 }
 
-# Renders one Gaussian, forward and backward: code for another processor is found only when it runs.
+# This program renders one Gaussian, forward and backward: code for another processor fails only when it runs.
 TRIAL = """
 import json, sys
 sys.path[:] = json.loads(sys.argv[1])
@@ -87,6 +87,6 @@ try:
     kernels = f", with {native.instruction_set()} kernels" if native else ""
     print(json.dumps([True, "can run here" + kernels, False]))
 except UserError as error:
-    # with a reason "auto" takes another backend; an instruction set that is requested in vain stops everything
+    # With a reason "auto" uses another backend; without one (a missing instruction set is requested) nothing runs.
     print(json.dumps([False, reason or str(error), reason is not None]))
 """

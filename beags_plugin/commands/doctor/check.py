@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 class Check:
     """The result of one check.
 
-    name: of the thing that is checked. ok: it is there and works. sentence: the finding, or advice. required: beags
-    cannot run without it. repair: the one command that repairs it; "" if it works or no command repairs it.
+    name: of the part. ok: whether it exists and works. sentence: the result, or advice. required: whether beags cannot
+    run without it. repair: the one command that repairs it; "" if it works or no command repairs it.
     """
 
     name: str
@@ -31,7 +31,7 @@ def first_line(error: BaseException) -> str:
 
 
 def print_check(check: Check, console: Console | None = None) -> None:
-    """Print a check: "ok", "missing" (beags cannot run) or "absent" (something optional), and below it the repair."""
+    """Print a check as "ok", "missing" (beags cannot run) or "absent" (optional), with the repair below."""
     from rich.console import Console
     from rich.table import Column, Table
     from rich.text import Text

@@ -12,7 +12,7 @@ from beags_plugin.commands.doctor.backends import first_contact_check, rasterize
 from beags_plugin.commands.doctor.check import Check, first_line
 
 _OPENCV = "pip install --force-reinstall --no-deps opencv-contrib-python-headless==4.10.0.84"
-_REPAIRS = {  # by the name of a check that raises
+_REPAIRS = {  # Repair for a check that raises, by its name.
     "torch": "pip install torch",
     "nerfstudio": "pip install nerfstudio==1.1.5",
     "opencv": _OPENCV,
@@ -21,7 +21,7 @@ _REPAIRS = {  # by the name of a check that raises
 
 
 def diagnose() -> Iterator[Check]:
-    """Check everything that beags uses, the quick ones first; never fails, whatever is missing or broken."""
+    """Check everything that beags uses, quick checks first; never raises, whatever is missing or broken."""
     for check in (_python, _nvcc, _presets, _opencv, _masks, _torch, _cuda, _nerfstudio, _open3d):
         yield _safely(check)
     yield from map(_safely, rasterizers())
@@ -42,7 +42,7 @@ def checks_of_data(data: Path | None) -> Iterator[Check]:
     from beags_plugin.views.data_options import DataOptions
     from beags_plugin.views.scene_data import SceneData
 
-    scene, output = SceneData(DataOptions(data=data)), Path("outputs")  # nerfstudio's usual folder
+    scene, output = SceneData(DataOptions(data=data)), Path("outputs")  # Nerfstudio's default folder.
     train, held_out = (len(scene.split(split).cameras) for split in ("train", "val"))
     free = {
         "memory": (available_mb(), "beside this program"),
@@ -57,7 +57,7 @@ def checks_of_data(data: Path | None) -> Iterator[Check]:
 def _safely(check: Callable[[], Check]) -> Check:
     try:
         return check()
-    # BaseException but for Ctrl-C: a broken native library may raise anything, SystemExit too.
+    # A broken native library may raise anything, even SystemExit.
     except KeyboardInterrupt:
         raise
     except BaseException as error:
@@ -84,24 +84,24 @@ def _nerfstudio() -> Check:
 
     if find_spec("nerfstudio") is None:
         raise ModuleNotFoundError("No module named 'nerfstudio'")
-    ok = (found := version("nerfstudio")) == "1.1.5"
-    sentence = found if ok else f"{found}, but the plugin is made for 1.1.5"
+    ok = (installed := version("nerfstudio")) == "1.1.5"
+    sentence = installed if ok else f"{installed}, but the plugin is made for 1.1.5"
     return Check("nerfstudio", ok, sentence, repair="" if ok else _REPAIRS["nerfstudio"])
 
 
 def _presets() -> Check:
     from importlib.metadata import entry_points
 
-    found = [point.name for point in entry_points(group="nerfstudio.method_configs") if point.name.startswith("beags")]
-    if not found:
+    names = [point.name for point in entry_points(group="nerfstudio.method_configs") if point.name.startswith("beags")]
+    if not names:
         return Check("presets", False, "ns-train does not know any preset of beags", repair=_REPAIRS["presets"])
-    return Check("presets", True, f"ns-train knows {', '.join(sorted(found))}")
+    return Check("presets", True, f"ns-train knows {', '.join(sorted(names))}")
 
 
 def _opencv() -> Check:
     import cv2
 
-    # Plain opencv installed over contrib leaves an empty ximgproc, so look for the function itself.
+    # Plain opencv installed over contrib leaves an empty ximgproc, so the function itself is checked.
     ok = hasattr(getattr(cv2, "ximgproc", None), "guidedFilter")
     sentence = f"{cv2.__version__} {'with' if ok else 'without'} cv2.ximgproc.guidedFilter"
     return Check("opencv contrib", ok, sentence, repair="" if ok else _OPENCV)

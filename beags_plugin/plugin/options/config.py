@@ -42,7 +42,7 @@ def _adam_fuses_on_cpus() -> bool:
 
 
 class _ConfigDumper(yaml.Dumper):
-    """PyYAML's writer of Python objects; a path is one word, which people can read and edit."""
+    """PyYAML's writer of Python objects; a path is one word, so that people can read and edit it."""
 
     def path(self, path: PurePath) -> yaml.Node:
         tag = f"tag:yaml.org,2002:python/object/apply:pathlib.{type(path).__name__}"
@@ -54,12 +54,12 @@ _ConfigDumper.add_multi_representer(PurePath, _ConfigDumper.path)
 
 def config_text(config: BeagsTrainerConfig) -> str:
     """Return the content of config.yml, which nerfstudio's loader reads too."""
-    return yaml.dump(config, Dumper=_ConfigDumper, width=10_000)  # a long path stays on its line
+    return yaml.dump(config, Dumper=_ConfigDumper, width=10_000)  # A long path stays on its line.
 
 
 @dataclass
 class FusedAdamConfig(AdamOptimizerConfig):
-    """Options of one group of parameters in the scene's AdamW, which goes over each parameter in one pass."""
+    """Options of one group of parameters in the scene's AdamW, which updates each parameter in one pass."""
 
     fused: Suppress[bool] = field(default_factory=_adam_fuses_on_cpus)
 
@@ -69,30 +69,30 @@ class BeagsTrainerConfig(TrainerConfig):
     """A nerfstudio trainer config whose paths are absolute once it is saved."""
 
     _target: type = field(default_factory=lambda: load("beags_plugin.plugin.trainer:BeagsTrainer"))
-    prompt: Suppress[str | None] = None  # for fields made from text
+    prompt: Suppress[str | None] = None  # It is for fields made from text.
     output_dir: Annotated[Path, OUTPUT_DIR] = Path("outputs")
     """Folder of all runs: see run_dir."""
     run_dir: Path | None = None
     """Folder of this run; None puts it where nerfstudio does (output_dir/experiment/method/timestamp)."""
     overwrite: bool = False
-    """Replace the run that lies in the folder; without it, a folder that holds a checkpoint is refused."""
+    """Replace the run in the folder; without this option, a folder that holds a checkpoint is refused."""
     max_num_iterations: int = 0
     """Step of the schedule to stop after; 0 runs base_steps + refine_steps."""
     steps_per_held_out: int = 0
-    """Steps between two measurements of all held-out views, kept in held_out.json of the run; 0: never."""
+    """Steps between two measurements of all held-out views, written to held_out.json of the run; 0: never."""
 
     check_memory: bool = True
-    """Do not begin where hardly any memory or disk is free; save and stop when memory runs out (on a CPU)."""
+    """Refuse to begin if hardly any memory or disk is free; save and stop when memory runs out (on a CPU)."""
 
     steps_per_objects: int = 500
     """Steps between two measurements of extracted masks on four held-out views, with a picture of every object alone,
-    for tensorboard or wandb, once Gaussians have classes; the first and the last step are measured too; 0: never."""
+    for tensorboard or wandb, from the first step with classes to the last; 0: never."""
 
     run_format: Suppress[int] = RUN_FORMAT
-    """Version of the files of a run that is trained with this config."""
+    """Version of the run's files."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Refuse a run of another format, where nerfstudio's own loader reads config.yml."""
+        """Reject a run of another format when nerfstudio's own loader reads its config.yml."""
         if state.get("run_format") != RUN_FORMAT:
             print_user_errors_plainly()
             raise other_format("this run", state.get("run_format"))
@@ -110,18 +110,18 @@ class BeagsTrainerConfig(TrainerConfig):
 
     @property
     def data_path(self) -> Path:
-        """The folder (or transforms .json) that the run is trained on: --data, or the data parser's own."""
+        """The folder (or transforms .json) of the training data: --data, or the data parser's own."""
         return Path(self.data_config.data or self.data_config.dataparser.data)
 
     def text_in(self, folder: Path) -> str:
-        """Return the config.yml of a run in ``folder`` that is made of this one."""
-        own = deepcopy(self)
+        """Return the text of the config.yml of a run in ``folder`` made from this one."""
+        other = deepcopy(self)
         for name, value in {**dict.fromkeys(BEGINNINGS), "run_dir": folder}.items():
-            setattr(own, name, value)
-        return config_text(own)
+            setattr(other, name, value)
+        return config_text(other)
 
     def check(self) -> None:
-        """Raise ``UserError`` for a value with which no training can run."""
+        """Raise ``UserError`` for a value with which training cannot run."""
         if self.max_num_iterations < 0:
             raise UserError(f"--max-num-iterations is {self.max_num_iterations}: give a number of steps, 0 for all.")
         if self.steps_per_save < 1:
@@ -133,7 +133,7 @@ class BeagsTrainerConfig(TrainerConfig):
         return self.run_dir if self.run_dir is not None else super().get_base_dir()
 
     def set_timestamp(self) -> None:
-        """Check the devices, as nerfstudio calls this first for a new run, and set the time in the folder's name."""
+        """Set the time in the folder's name; check the devices before, as nerfstudio calls this first for a new run."""
         try:
             check_machine(self.machine)
         except UserError as error:
@@ -141,10 +141,10 @@ class BeagsTrainerConfig(TrainerConfig):
         super().set_timestamp()
 
     def print_to_terminal(self) -> None:
-        """Print nothing: config.yml says what nerfstudio would print in 250 lines."""
+        """Print nothing; nerfstudio would print 250 lines, which config.yml has too."""
 
     def save_config(self) -> None:
-        """Save config.yml, the first file of a run, with absolute paths; end the program if another trains there."""
+        """Save config.yml, the first file of a run, with absolute paths; exit if another process trains there."""
         try:
             with writing(run := self.get_base_dir()):
                 rollback.note(run)
@@ -158,24 +158,27 @@ class BeagsTrainerConfig(TrainerConfig):
         except UserError as error:
             stop(error)
 
-    def _check_place(self, run: Path) -> None:
-        """Raise ``UserError`` where this run would replace the checkpoints of another one."""
-        saved = [*run.glob(f"{self.relative_model_dir}/*.ckpt"), *run.glob(f"{rollback.REPLACED}/*.ckpt")]
+    def continues(self, run: Path) -> bool:
+        """Return whether the training loads a checkpoint of ``run``, the folder that it writes to."""
         loaded = self.load_dir or (self.load_checkpoint and Path(self.load_checkpoint).parent)
-        goes_on = loaded is not None and Path(loaded).resolve().parent == run.resolve()
-        if saved and not (goes_on or self.overwrite):
+        return loaded is not None and Path(loaded).resolve().parent == run.resolve()
+
+    def _check_place(self, run: Path) -> None:
+        """Raise ``UserError`` if this run would replace the checkpoints of another one."""
+        saved = [*run.glob(f"{self.relative_model_dir}/*.ckpt"), *run.glob(f"{rollback.REPLACED}/*.ckpt")]
+        if saved and not (self.continues(run) or self.overwrite):
             raise UserError(
                 f"{run} holds a run: go on with it (beags resume {quoted(run)}), replace it (--overwrite True), or "
                 "choose another --run-dir."
             )
-        self.overwrite = False  # saved, it would hold for every later ns-train --load-config too
+        self.overwrite = False  # Once saved, it would also apply to every later ns-train --load-config.
 
     def _save(self) -> None:
         self.output_dir = Path(self.output_dir).absolute()
         for name in ("run_dir", "load_dir", "load_checkpoint"):
             if (path := getattr(self, name)) is not None:
                 setattr(self, name, Path(path).absolute())
-        if self.data_config.data is not None:  # nerfstudio lets the data parser have it when a run begins
+        if self.data_config.data is not None:  # Nerfstudio copies it to the data parser when a run begins.
             self.data_config.dataparser.data = self.data_config.data
         for holder in (self, self.data_config, self.data_config.dataparser):
             if (data := getattr(holder, "data", None)) is not None:
@@ -186,7 +189,7 @@ class BeagsTrainerConfig(TrainerConfig):
 
 
 def _read_by_nerfstudio(loader: yaml.constructor.SafeConstructor, node: yaml.Node) -> Iterator[BeagsTrainerConfig]:
-    """Build a config that an ns-* command reads, in the place where its run lies now."""
+    """Build a config that an ns-* command reads, with the place where its run lies now."""
     config = BeagsTrainerConfig.__new__(BeagsTrainerConfig)
     yield config
     assert isinstance(node, yaml.MappingNode)
@@ -201,7 +204,7 @@ for _former, _kind in MOVED.items():
 
 
 def base_config() -> BeagsTrainerConfig:
-    """Return the documented base: the full schedule (method, sections 1 and 7; 33,000 steps).
+    """Return the documented base config: the full schedule (method, sections 1 and 7; 33,000 steps).
 
     Learning rates, losses and schedules are those of the 2DGS and BEA-GS papers; a preset states what it changes.
     """
@@ -215,7 +218,7 @@ def base_config() -> BeagsTrainerConfig:
             _target=load("beags_plugin.plugin.pipeline:BeagsPipeline"),
             datamanager=BeagsDataManagerConfig(
                 dataparser=BeagsDataParserConfig(),
-                cache_images="gpu",  # nerfstudio's word for "on the model's device"; "cpu" would pin memory
+                cache_images="gpu",  # Nerfstudio means the model's device; "cpu" would pin memory.
                 cache_images_type="uint8",
             ),
             model=BeagsModelConfig(
@@ -230,7 +233,7 @@ def base_config() -> BeagsTrainerConfig:
             ),
         ),
         optimizers={
-            # positions follow BeagsModelConfig.position_lr; the rate here is only what Adam is built with
+            # Adam is built with these rates; those of positions then follow BeagsModelConfig.position_lr.
             name: {"optimizer": FusedAdamConfig(lr=rate, eps=1e-15), "scheduler": None}
             for name, rate in {
                 "means": 1.6e-4,

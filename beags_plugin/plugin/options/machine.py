@@ -10,7 +10,7 @@ from beags_plugin.system.errors import UserError
 
 
 def default_device() -> str:
-    """Return the default device: "cuda" where there is a GPU on which our kernels have passed a trial, else "cpu"."""
+    """Return "cuda" if there is a GPU on which our kernels have passed a trial, else "cpu"."""
     first_contact.settle()
     return "cpu" if cuda_extension.status()[1] else "cuda"
 

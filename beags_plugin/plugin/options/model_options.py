@@ -16,7 +16,7 @@ class BeagsModelConfig(SceneOptions, ModelConfig):
     """Options of the scene and of its two training phases."""
 
     _target: type = field(default_factory=lambda: load("beags_plugin.plugin.model:BeagsModel"))
-    enable_collider: Suppress[bool] = False  # this and the next four are for fields of rays
+    enable_collider: Suppress[bool] = False  # This and the next four are for radiance fields.
     collider_params: Suppress[dict[str, float] | None] = None
     loss_coefficients: Suppress[dict[str, float]] = field(default_factory=dict)
     eval_num_rays_per_chunk: Suppress[int] = 4096

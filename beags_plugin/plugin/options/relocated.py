@@ -6,32 +6,22 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 from beags_plugin.runs.layout import newest_checkpoint
-from beags_plugin.runs.relocation import Placed, check_data, relocate
+from beags_plugin.runs.relocation import check_data, relocate
 from beags_plugin.system.errors import print_user_errors_plainly
 from beags_plugin.system.program import path_option, program_name
 
-_named: list[Path] = []  # config.yml files that Python code has said it reads
-
-
-class OpenedConfig(Placed, Protocol):
-    """A config as nerfstudio's programs read it."""
-
-    overwrite: bool
-
-    def get_checkpoint_dir(self) -> Path:
-        """Return the folder of the run's checkpoints."""
-        ...
+_named: list[Path] = []  # Files config.yml named by ``named``.
 
 
 @contextmanager
 def named(config_path: Path) -> Iterator[None]:
-    """Say which config.yml nerfstudio's functions, such as ``eval_setup``, read in this block.
+    """Name the config.yml that nerfstudio's functions, such as ``eval_setup``, read in this block.
 
-    Its programs hand PyYAML a text, so that a run which was moved is found by the --load-config of the command line;
-    Python code that calls them has none.
+    They pass PyYAML only the text of the file. In nerfstudio's programs the option --load-config names the file, which
+    a moved run needs; Python code has no such option.
     """
     _named.append(config_path)
     try:
@@ -40,8 +30,11 @@ def named(config_path: Path) -> Iterator[None]:
         _named.pop()
 
 
-def place_for_nerfstudio(config: OpenedConfig) -> None:
-    """Place a config that an ns-* command reads from YAML where its --load-config says that the run lies."""
+def place_for_nerfstudio(config: Any) -> None:
+    """Set the place of a run whose config an ns-* command reads from YAML to the folder of its --load-config.
+
+    config: a ``BeagsTrainerConfig``.
+    """
     path = _named[-1] if _named else path_option("--load-config")
     if path is None:
         return

@@ -1,4 +1,4 @@
-"""The folder of a run as it was before a training: restored where the training is refused with nothing saved."""
+"""Restore the folder of a run if a training is refused before it has saved anything."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from pathlib import Path
 from beags_plugin.system.lock import LOCK
 
 REPLACED = "replaced_models"
-"""Folder of a run: checkpoints of an earlier one in the same place, until the new one has its own."""
+"""Folder in a run for the checkpoints of an earlier run, until the new one has its own."""
 _MODELS = "nerfstudio_models"
 _REWRITTEN = ("config.yml", "training.json", "dataparser_transforms.json", "start.json", "held_out.json")
 _ADDED = (LOCK, "events.out.tfevents.*", "prepared", "base", "wandb")
-"""What a training writes before its first checkpoint; other programs may write into the folder too."""
+"""Files that a training adds before its first checkpoint; other programs may write into the folder too."""
 
 _noted: dict[Path, Rollback] = {}
 
 
 class Rollback:
-    """Notes what is in the folder of a run; make it before a training writes there, and undo under the run's lock."""
+    """The content of a run's folder before a training writes there; call ``undo`` under the run's lock."""
 
     def __init__(self, run: Path) -> None:
         self.run = run.absolute()
@@ -29,11 +29,11 @@ class Rollback:
         self._saved = set(self.run.glob(f"{_MODELS}/*.ckpt"))
 
     def undo(self) -> bool:
-        """Take back what was written since; does nothing, and returns False, where a checkpoint has been saved."""
+        """Undo what was written since; do nothing and return False if a checkpoint has been saved."""
         models = self.run / _MODELS
         if set(models.glob("*.ckpt")) - self._saved:
             return False
-        with suppress(OSError):  # of the disk that the refusal is about
+        with suppress(OSError):  # The disk may be why the training was refused.
             for path in {self.run / name for name in _REWRITTEN} - set(self._files):
                 path.unlink(missing_ok=True)
             for path in {path for pattern in _ADDED for path in self.run.glob(pattern)} - self._others:
@@ -50,10 +50,10 @@ class Rollback:
 
 
 def note(run: Path) -> None:
-    """Note the folder of a run for the training of this process that is about to begin there."""
+    """Record the folder of a run before this process trains there."""
     _noted[run.absolute()] = Rollback(run)
 
 
 def noted(run: Path) -> Rollback:
-    """Return what was noted of a run; it is noted now if that has not been done."""
+    """Return the record of a run's folder, made now if there is none."""
     return _noted.pop(run.absolute(), None) or Rollback(run)

@@ -12,15 +12,12 @@ from beags_plugin.runs.run_config import RunConfigLoader, loaded
 
 
 def load_run_config(path: Path) -> BeagsTrainerConfig:
-    """Read the config of a run, for nerfstudio, without executing code.
-
-    Raises ``UserError`` for any other file, or an older run's.
-    """
+    """Read a run's config for nerfstudio without executing code; raises ``UserError`` as ``runs.run_config.loaded``."""
     return loaded(path, lambda text: yaml.load(text, Loader=RunConfigLoader), BeagsTrainerConfig)  # noqa: S506  (it refuses)
 
 
 def open_for_training(config_path: Path, data: Path | None = None) -> BeagsTrainerConfig:
-    """Do as ``runs.relocation.open_run``, for nerfstudio."""
+    """Open a run's config as ``runs.relocation.open_run`` does, for nerfstudio."""
     config = load_run_config(config_path)
     relocate(config, config_path, data)
     return config

@@ -20,7 +20,7 @@ from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.views.held_out_views import HeldOutViews
 
-SHARPENED = 0.5  # share of a refinement whose base has seen no close-ups
+SHARPENED = 0.5  # Share of refinement that sharpens, if the base has seen no close-ups.
 
 
 def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
@@ -46,10 +46,10 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
         trainer.keep("curves", curves)
 
     def before(step: int) -> None:
-        trainer.stop_if_asked(step)
+        trainer.stop_if_requested(step)
         model.step = step
         every = trainer.config.logging.steps_per_log
-        model.measuring = every > 0 and step % every == 0  # nerfstudio reads no other step's
+        model.measuring = every > 0 and step % every == 0  # Nerfstudio reads only these steps' metrics.
         densifier.before_step(step)
         switch.before_step(step)
         if curves is not None:
@@ -74,14 +74,14 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
 
 
 def focus(model: SceneModel, datamanager: BeagsDataManager) -> None:
-    """Begin to see close-ups of objects, and sharpen these in a refinement whose base has seen none."""
+    """Show close-ups of objects to training; a refinement whose base has seen none sharpens the objects."""
     datamanager.focus()
     if datamanager.close_ups is not None and model.schedule.base_steps == 0:
         model.schedule = replace(model.schedule, sharpened=SHARPENED)
 
 
 def _curves(model: SceneModel, trainer: TrainingRun, datamanager: BeagsDataManager) -> Curves | None:
-    """Return the writer of this run's curves; None where nobody would read them."""
+    """Return the writer of this run's curves; None if no program reads them."""
     config = trainer.config
     if not (config.is_tensorboard_enabled() or config.is_wandb_enabled() or config.is_comet_enabled()):
         return None
@@ -90,7 +90,7 @@ def _curves(model: SceneModel, trainer: TrainingRun, datamanager: BeagsDataManag
 
 
 def own_learning_rates(model: SceneModel, adam: Adam, step: int) -> None:
-    """Set the rates of this step that a refiner which owns its training asks for."""
+    """Set the rates of this step to those of a refiner that makes its steps itself."""
     own = model.own_training
     if own is not None and (rates := own.rates(step - model.schedule.base_steps)) is not None:
         for group in adam.param_groups:
@@ -98,7 +98,7 @@ def own_learning_rates(model: SceneModel, adam: Adam, step: int) -> None:
 
 
 def set_learning_rates(model: SceneModel, adam: Adam, configs: dict[str, Any], step: int) -> None:
-    """Set every group's rate, decay and eps for this step; a checkpoint of the base may hold others."""
+    """Set every group's rate, decay and eps for this step, since a checkpoint of the base may hold others."""
     progress, refining = model.schedule.progress(step), model.schedule.refining(step)
     from_seeds = not (refining or model.schedule.warm)
     faster = model.config.base_lr_factor if from_seeds else 1.0

@@ -1,4 +1,4 @@
-"""The checkpoints of a run: saved, restored, and those of an earlier run set aside."""
+"""Save and restore the checkpoints of a run, and set aside those of an earlier run."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any, cast
 
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.pipelines.base_pipeline import Pipeline
-from nerfstudio.utils.rich_utils import CONSOLE
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
@@ -19,9 +18,10 @@ from beags_plugin.runs.checkpoint_file import model_state, read_checkpoint
 from beags_plugin.runs.layout import REPORT_FILE, newest_checkpoint
 from beags_plugin.runs.write import save_atomically
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import say
 from beags_plugin.system.reading.text import reason
 
-_MISFITS = (RuntimeError, LookupError, ValueError, TypeError, AttributeError)  # what loading a foreign state may raise
+_MISFITS = (RuntimeError, LookupError, ValueError, TypeError, AttributeError)  # Raised by foreign states.
 
 
 class Checkpoints:
@@ -42,14 +42,8 @@ class Checkpoints:
 
     @property
     def loads(self) -> bool:
-        """True if a checkpoint is loaded; a scene to start from does not count then."""
+        """Return whether a checkpoint is loaded, in which case ``start_from`` has no effect."""
         return self.config.load_dir is not None or self.config.load_checkpoint is not None
-
-    @property
-    def goes_on(self) -> bool:
-        """True if this run goes on in its own folder."""
-        loaded = self.config.load_dir or (self.config.load_checkpoint and self.config.load_checkpoint.parent)
-        return loaded is not None and loaded.resolve().parent == self.base_dir.resolve()
 
     @property
     def path(self) -> Path | None:
@@ -62,7 +56,7 @@ class Checkpoints:
         return config.load_dir / f"step-{config.load_step:09d}.ckpt"
 
     def restore(self, path: Path, pipeline: Pipeline, optimizers: Optimizers, scaler: GradScaler) -> int:
-        """Restore pipeline, optimizers and scaler from a checkpoint; returns the next step.
+        """Restore pipeline, optimizers and scaler from a checkpoint; return the next step.
 
         ``keep`` restores the other parts later. Raises ``UserError`` for a file that is no checkpoint, does not fit
         this run, or refines other classes.
@@ -70,7 +64,7 @@ class Checkpoints:
         checkpoint = read_checkpoint(path)
         states = training_state(checkpoint, path)
         model = cast(SceneModel, pipeline.model)
-        named = dict(model.classes)  # by the data
+        classes = dict(model.classes)  # The data's; loading replaces them.
         model_state(checkpoint, path)
         try:
             pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])
@@ -78,18 +72,19 @@ class Checkpoints:
             scaler.load_state_dict(checkpoint["scalers"])
         except _MISFITS as error:
             raise _misfit(path, error) from error
-        if model.classes != named:
-            if self.goes_on or int(model.refined_steps) > 0:
+        if model.classes != classes:
+            if self.config.continues(self.base_dir) or int(model.refined_steps) > 0:
                 raise UserError(
                     f"the classes of {self.config.data_path} are not those with which training began "
                     f"({', '.join(model.classes.values())}): restore classes.json and the masks, or train again."
                 )
-            model.take_classes(named)  # of a base, which refinement assigns anew
+            model.take_classes(classes)  # Refinement assigns the classes of a base anew.
             states.pop("refinement", None)
-        CONSOLE.print(f"Loaded {path}", highlight=False, markup=False, soft_wrap=True)
-        self.loaded_run = self.base_dir.absolute() if self.goes_on else path.absolute().parent.parent
+        say(f"Loaded {path}")
+        continues = self.config.continues(self.base_dir)
+        self.loaded_run = self.base_dir.absolute() if continues else path.absolute().parent.parent
         if model.schedule.base_steps == 0 and int(model.refined_steps) == 0:
-            return 0  # a base that was loaded: refinement counts its own steps, and begins anew
+            return 0  # Refinement of a loaded base begins at its own step 0.
         self._loaded_states, self._loaded_from = states, path
         return checkpoint["step"] + 1
 
@@ -104,8 +99,8 @@ class Checkpoints:
             except _MISFITS as error:
                 raise _misfit(self._loaded_from, error, name) from error
 
-    def all_are_kept(self) -> None:
-        """Drop the loaded states of parts that nobody keeps."""
+    def drop_loaded_states(self) -> None:
+        """Drop the loaded states of parts that this run does not have."""
         self._loaded_states = {}
 
     def save(self, step: int, pipeline: Pipeline, optimizers: Optimizers, scaler: GradScaler) -> None:
@@ -129,18 +124,17 @@ class Checkpoints:
 
     def set_aside(self) -> None:
         """Move away the checkpoints of an earlier run in this folder, and remove its report."""
-        if self.goes_on:
+        if self.config.continues(self.base_dir):
             return
         (self.base_dir / REPORT_FILE).unlink(missing_ok=True)
         if any(self.folder.glob("*.ckpt")):
             former = self.base_dir / REPLACED
             shutil.rmtree(former, ignore_errors=True)
             self.folder.rename(former)
-            CONSOLE.print(
+            say(
                 f"{self.base_dir} holds an earlier run; its checkpoint is in {REPLACED} until this one saves its "
-                "first. (beags resume goes on with a run instead.)",
-                highlight=False, markup=False, soft_wrap=True,
-            )  # fmt: skip
+                "first. (beags resume continues a run instead.)"
+            )
 
 
 def _misfit(path: Path | None, error: Exception, part: str = "") -> UserError:

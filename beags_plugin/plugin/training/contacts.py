@@ -1,4 +1,4 @@
-"""The last change of a refinement: objects are closed where others hid them."""
+"""Close objects where other objects hid them: the last change of a refinement."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import torch
 
 from beags_plugin.core.densification import Densified
 from beags_plugin.core.membership import Membership
-from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
@@ -19,21 +18,21 @@ from beags_plugin.surfaces.contact_faces import contact_faces
 from beags_plugin.surfaces.item import Viewpoints
 from beags_plugin.surfaces.mesh_options import MeshOptions
 
-MOST_VIEWS = 30  # that are rendered for each object, at even distances
-RESOLUTION = 96  # voxels along an object's longest side
+MOST_VIEWS = 30  # Views rendered for each object, evenly spaced.
+RESOLUTION = 96  # Voxels along an object's longest side.
 
 
 @torch.no_grad()
 def close_contacts(
     model: SceneModel, datamanager: BeagsDataManager, progress: Callable[[int, int], None]
 ) -> tuple[Edit, str]:
-    """Return the edit that adds the Gaussians of ``export.contact_faces``, and a line that counts them.
+    """Return the edit that adds the Gaussians of ``surfaces.contact_faces``, and a line that counts them.
 
-    All of it runs on the CPU, where meshes are made. progress: receives (done, total).
+    Everything runs on the CPU, as meshing does. progress: receives (done, total).
     """
     views = datamanager.views("train")
     chosen = [views[index] for index in range(0, len(views), -(-len(views) // MOST_VIEWS))]
-    scene = Surfels(**{name: values.cpu() for name, values in vars(model.surfels().detach()).items()})
+    scene = model.surfels().detach().to("cpu")
     class_ids = model.class_ids.cpu()
     rasterizer = model.rasterizer if model.device.type == "cpu" else make_rasterizer()
     faces = contact_faces(
@@ -49,12 +48,11 @@ def close_contacts(
     counts = ", ".join(f"{count} of {name}" for count, name in zip(added, model.classes.values(), strict=True) if count)
     line = f"closed where neighbours hide objects: {counts} Gaussians added" if counts else "no contact to close"
     device, own = model.device, torch.arange(len(scene))
-    # a Gaussian of the same object lends its class
+    # Each new Gaussian takes its class from a Gaussian of the same object.
     lenders = {class_id: int((class_ids == class_id).int().argmax()) for class_id in faces.class_ids.unique().tolist()}
     source = torch.cat([own, torch.tensor([lenders[each] for each in faces.class_ids.tolist()], dtype=torch.int64)])
-    both = joined(scene, faces.surfels)
     edited = Densified(
-        Surfels(**{name: values.to(device) for name, values in vars(both).items()}),
+        joined(scene, faces.surfels).to(device),
         source.to(device),
         (torch.arange(len(source)) >= len(own)).to(device),
     )

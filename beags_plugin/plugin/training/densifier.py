@@ -18,19 +18,19 @@ from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system.progress import say
 
-SHARPEN_EVERY = 50  # steps between two rounds of growth in a refinement that sharpens
-MOST_FREED = 0.2  # share of the Gaussians; where more reach before cameras, seed points tell too little of what is near
+SHARPEN_EVERY = 50  # Steps between two rounds of growth in a refinement that sharpens.
+MOST_FREED = 0.2  # Largest share of Gaussians to remove: with more, seed points are too few to bound near surfaces.
 
 
 class Densifier:
-    """Grows and prunes the base by the screen gradients that it gathers, and by what views show."""
+    """Grows and prunes the base by gathered screen gradients and by free space before cameras."""
 
     def __init__(self, model: SceneModel, adam: Adam, datamanager: BeagsDataManager) -> None:
         self.model = model
         self.datamanager = datamanager
         cameras = datamanager.train_dataset.cameras
         self.camera_centers = cameras.camera_to_worlds[:, :3, 3]  # [V, 3] world
-        pixels = int((cameras.height * cameras.width).sum())  # of all whole training images
+        pixels = int((cameras.height * cameras.width).sum())  # Pixels of all whole training images.
         stated, close_ups = model.config.densify.scaled(model.schedule.scale), datamanager.close_ups
         of_objects, elsewhere = (0, pixels) if close_ups is None else shared_pixels(pixels, close_ups.object_pixels())
         self.config, self.most_near = stated.bounded(elsewhere), stated.bounded(of_objects).max_surfels
@@ -40,29 +40,26 @@ class Densifier:
         self.free = self._free_depths()
 
     def state(self) -> dict[str, Any]:
-        """Return the statistics since the scene last grew, as long as it grows, and whether cameras are freed.
-
-        See ``resumable.Resumable``.
-        """
-        found = self.statistics if self.model.growing else GradientStatistics(0)
+        """Return the statistics since the last growth, and whether space before cameras is freed; see ``Resumable``."""
+        statistics = self.statistics if self.model.growing else GradientStatistics(0)
         near = {}
         if self.near is not None and self.model.growing:
             near = {"near": [self.near.shown, self.near.inside]}
-        return {"total": found.total, "views": found.views, "frees": self.free is not None, **near}
+        return {"total": statistics.total, "views": statistics.views, "frees": self.free is not None, **near}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on gathering."""
+        """Continue from ``state``."""
         if not state["frees"]:
             self.free = None
         if len(state["total"]) == self.model.num_points:
-            kept = self.statistics
-            kept.total, kept.views = state["total"].clone().to(kept.total), state["views"].clone().to(kept.views)
+            own = self.statistics
+            own.total, own.views = state["total"].clone().to(own.total), state["views"].clone().to(own.views)
             if self.near is not None and "near" in state:
                 shown, inside = state["near"]
-                self.near.shown, self.near.inside = shown.clone().to(kept.total), inside.clone().to(kept.total)
+                self.near.shown, self.near.inside = shown.clone().to(own.total), inside.clone().to(own.total)
 
     def before_step(self, step: int) -> None:
-        """Have the step's screen gradients computed as long as the scene still grows; a trained one does not."""
+        """Turn on screen gradients for the step if the scene still grows."""
         model, schedule = self.model, self.model.schedule
         of_base = not schedule.warm and step + 1 < min(self.config.stop, schedule.base_steps)
         model.growing = of_base or self._sharpens(step)
@@ -72,7 +69,7 @@ class Densifier:
         return model.schedule.sharpening(step) and not model.frozen and model.own_training is None
 
     def after_step(self, step: int) -> None:
-        """Gather statistics; densify, free the space before cameras and reset opacities when their step has come."""
+        """Gather statistics; densify, free the space before cameras and reset opacities at their steps."""
         config, schedule, done = self.config, self.model.schedule, step + 1
         growing = self.model.growing and self.model.last_render is not None
         if growing:
@@ -107,9 +104,9 @@ class Densifier:
         self._edit(densify(surfels, gradient, units, self.config, step, model.generator(step), apart))
 
     def _free_cameras(self) -> None:
-        """Remove the Gaussians that stand before a camera, where its photo shows what lies further off.
+        """Remove Gaussians in the free space before a camera, whose photo shows surfaces further away.
 
-        Nothing goes from here on where they are many: what is near may be smooth, without any seed point.
+        If they are many, nothing is removed from here on: near surfaces may be smooth and have no seed points.
         """
         if self.free is None:
             return
@@ -123,7 +120,7 @@ class Densifier:
             self._edit(Densified.unchanged(surfels).only(~before), keep_statistics=True)
 
     def _free_depths(self) -> tuple[list[Camera], Tensor] | None:
-        """Return the training cameras and up to which depth the space before each is free; None where nobody knows."""
+        """Return the training cameras and the depth up to which the space before each is free; None if unknown."""
         if self.config.free_share == 0.0:
             return None
         metadata = self.datamanager.train_dataparser_outputs.metadata
@@ -150,6 +147,5 @@ class Densifier:
         logits = reset_opacity(model.surfels().detach())
         parameter = model.gauss_params["opacities"]
         parameter.data = logits[:, None].contiguous()
-        everyone = torch.arange(logits.shape[0])
-        start_anew = torch.ones_like(everyone, dtype=torch.bool)
-        move_adam_state(self.adam, parameter, parameter, everyone, start_anew)
+        index = torch.arange(logits.shape[0])
+        move_adam_state(self.adam, parameter, parameter, index, torch.ones_like(index, dtype=torch.bool))

@@ -1,4 +1,4 @@
-"""Exposures of photos, learned with the scene: an affine colour transform for each, beside the mean photo's in all."""
+"""Exposures of photos, learned with the scene: an affine colour transform per photo, whose mean is the identity."""
 
 from __future__ import annotations
 
@@ -21,21 +21,22 @@ from beags_plugin.surfaces.color import linear_from_srgb
 from beags_plugin.system.progress import counted, progress_bar, say
 from beags_plugin.views.views import View, in_unit_range
 
-LEAST_SPREAD = 0.05  # EV; photos whose gains differ by less are taken to be of one exposure
-CERTAIN = 3.0  # times the noise of a gain, by which the photos' gains must differ to count as different
-RATES = 1e-2, 1e-3  # first and last learning rate of the transforms, log-linear, as 3DGS has them
-BETAS, EPS = (0.9, 0.999), 1e-15  # of Adam
-TOWARDS_START = 0.05  # weight of the squared change of a photo's transform in its step
-OPAQUE = 242  # alpha, of 255, from which a pixel of a photo shows the scene
+LEAST_SPREAD = 0.05  # EV; photos whose gains differ by less count as one exposure.
+CERTAIN = 3.0  # Photos differ if their gains differ by so many times the noise of a gain.
+RATES = 1e-2, 1e-3  # First and last learning rate of the transforms, log-linear, as in 3DGS.
+BETAS, EPS = (0.9, 0.999), 1e-15  # Adam's.
+TOWARDS_START = 0.05  # Weight of the squared distance of a photo's transform from its start.
+OPAQUE = 242  # Least alpha, of 255, of a pixel that shows the scene.
 GAMMA, OFFSET = 2.4, 0.055
-"""sRGB's curve but for the darkest values: (1 + OFFSET) light^(1 / GAMMA) - OFFSET, so that a gain is an affine map."""
+"""Of sRGB's curve above its darkest values, (1 + OFFSET) light^(1 / GAMMA) - OFFSET; there a gain is an affine map."""
 
 
 class PhotoExposures:
     """The transforms of V photos while they are learned; their mean over the photos is the identity throughout.
 
-    Each step moves the transform of its photo by the training loss and by a pull towards where it began, as Adam does.
-    Every photo has moments and a count of steps of its own, so that how far it moves does not hang on their number.
+    Each step moves its photo's transform by Adam, with the gradient of the training loss and of a pull towards the
+    start. Every photo has its own moments and step count, so that its step size does not depend on the number of
+    photos.
     """
 
     def __init__(self, model: SceneModel, exposures: Exposures) -> None:
@@ -43,38 +44,37 @@ class PhotoExposures:
         self.affine = exposures.affine.to(model.device).clone().requires_grad_()
         self.start = self.affine.detach().clone()
         self.identity = torch.eye(3, 4).to(self.affine)
-        self.moments = torch.zeros(2, *self.affine.shape).to(self.affine)  # Adam's, first and second
+        self.moments = torch.zeros(2, *self.affine.shape).to(self.affine)  # Adam's first and second.
         self.steps = torch.zeros(len(self.affine), dtype=torch.long)
-        model.exposures = Exposures(exposures.names, self.affine.detach())  # which shares the memory
-        self._seen: int | None = None
+        model.exposures = Exposures(exposures.names, self.affine.detach())  # Both share the memory.
+        self._photo: int | None = None  # Photo of the present step.
 
     def state(self) -> dict[str, Any]:
-        """Return where the transforms began, their moments and steps; see ``Resumable``."""
+        """Return the start of the transforms, their moments and steps; see ``Resumable``."""
         return {"start": self.start.cpu(), "moments": self.moments.cpu(), "steps": self.steps.clone()}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on with the moments of ``state``; the model has the transforms."""
+        """Continue from ``state``; the model has the transforms."""
         self.start, self.moments = state["start"].to(self.start), state["moments"].to(self.moments)
         self.steps = state["steps"].clone()
 
     def __call__(self, colors: Tensor, photo: int) -> Tensor:
         """Return colours [N, 3] as the photo shows them, with a gradient for its transform."""
-        self._seen = photo if torch.is_grad_enabled() else None
+        self._photo = photo if torch.is_grad_enabled() else None
         affine = self.affine[photo]
         return ordered_linear(colors, affine[:, :3], affine[:, 3])
 
     def after_step(self, step: int) -> None:
-        """Move the transform of the photo that this step saw by its gradient."""
+        """Update the transform of this step's photo."""
         gradient = self.affine.grad
-        if self._seen is None or gradient is None:
+        if (photo := self._photo) is None or gradient is None:
             return
         with torch.no_grad():
-            photo = self._seen
             gradient[photo] += 2.0 * TOWARDS_START * (self.affine[photo] - self.start[photo])
             rate = log_linear(*RATES, self.model.schedule.progress(step))
             self.affine[photo] -= rate * self._direction(photo, gradient[photo])
             self.affine -= self.affine.mean(dim=0) - self.identity
-        self.affine.grad, self._seen = None, None
+        self.affine.grad, self._photo = None, None
 
     def _direction(self, photo: int, gradient: Tensor) -> Tensor:
         """Return Adam's step [3, 4] of a photo at rate 1."""
@@ -87,13 +87,13 @@ class PhotoExposures:
 
 
 def exposures_of_run(model: SceneModel, datamanager: BeagsDataManager) -> PhotoExposures | None:
-    """Return the photos' exposures to learn, those of a loaded scene where it has any.
+    """Return the photos' exposures to learn, starting from those of a loaded scene if it has any.
 
-    None where photos have one exposure, and where no tracks of points tell. Those that are wanted all the same begin at
-    the identity.
+    None if the photos have one exposure, or if there are no tracks of points to compare them by. With the option "on"
+    they then begin at the identity.
     """
-    wanted = model.config.exposure
-    if wanted == "off":
+    option = model.config.exposure
+    if option == "off":
         model.exposures = None
         return None
     names = tuple(view.name for view in datamanager.views("train"))
@@ -102,91 +102,71 @@ def exposures_of_run(model: SceneModel, datamanager: BeagsDataManager) -> PhotoE
         of_name = dict(zip(known.names, known.affine.cpu(), strict=True))
         of_photos = [of_name.get(name, identity) for name, identity in zip(names, start, strict=True)]
         return PhotoExposures(model, Exposures(names, torch.stack(of_photos)))
-    if _of_turning_objects(model, datamanager):
-        return None
-    if (found := photo_gains(datamanager)) is None:
-        return PhotoExposures(model, Exposures(names, start)) if wanted == "on" else None
-    learned = wanted == "on" or _differ(found)
-    for line in _lines(found, names, learned):
+    if option == "auto" and datamanager.config.photos == "objects":
+        return None  # The objects turned in a light that stood still, which changes their brightness too.
+    if (measured := photo_gains(datamanager)) is None:
+        return PhotoExposures(model, Exposures(names, start)) if option == "on" else None
+    noise = float(np.median(measured.noise))
+    differ = max(measured.spread, measured.spread_of_colors) > max(LEAST_SPREAD, CERTAIN * noise)
+    learned = option == "on" or differ
+    for line in _lines(measured, names, learned):
         say(line)
-    return _begun(model, names, found) if learned else None
+    return _at_gains(model, names, measured) if learned else None
 
 
-def _begun(model: SceneModel, names: tuple[str, ...], found: Gains) -> PhotoExposures:
+def _at_gains(model: SceneModel, names: tuple[str, ...], measured: Gains) -> PhotoExposures:
     """Return transforms that begin at the gains of photos."""
     start = torch.eye(3, 4).repeat(len(names), 1, 1)
-    factors = torch.from_numpy(_factors(found)).float()
+    slopes = 2.0 ** (measured.stops / GAMMA)  # [V, 3]
+    factors = torch.from_numpy(slopes / slopes.mean(axis=0)).float()
     start[:, range(3), range(3)] = factors
     start[:, :, 3] = OFFSET * (factors - 1.0)
     return PhotoExposures(model, Exposures(names, start))
 
 
-def _of_turning_objects(model: SceneModel, datamanager: BeagsDataManager) -> bool:
-    """Return whether photos differ because objects turn in a light that stands, and nobody asked for exposures."""
-    return model.config.exposure == "auto" and datamanager.config.photos == "objects"
-
-
 def photo_gains(datamanager: BeagsDataManager) -> Gains | None:
-    """Return how bright the training photos show the points that tracks say they share; None without any."""
+    """Return the gains of the training photos, from their shared points; None without tracks."""
     tracks = cast(BeagsDataParser, datamanager.dataparser).tracks("train")
     if not any((ids >= 0).any() for ids, _ in tracks):
         return None
     places, light = [], []
     with progress_bar("Comparing exposures", passing=True) as progress:
         for index, view in enumerate(counted(datamanager.views("train"), len(tracks), progress)):
-            held = view.data()
-            image = in_unit_range(held["image"]).cpu()
+            data = view.data()
+            image = in_unit_range(data["image"]).cpu()
             ids, shares = tracks[index]
             xy = datamanager.files["train"].straightened(shares, index)[1]
-            inside = ((xy >= 0) & (xy < image.shape[1::-1])).all(axis=1)  # Without its lens a photo shows less.
-            inside[inside] = _shown(view, held, datamanager)[tuple(xy[inside].astype(np.int64).T[::-1])]
+            inside = ((xy >= 0) & (xy < image.shape[1::-1])).all(axis=1)  # An undistorted photo shows less.
+            inside[inside] = _used(view, data, datamanager)[tuple(xy[inside].astype(np.int64).T[::-1])]
             places.append(np.where(inside, ids, -1))
             light.append(linear_from_srgb(interpolated(image, xy)))
     return gains(sightings(places, light), len(tracks))
 
 
-def _shown(view: View, held: dict[str, Tensor], datamanager: BeagsDataManager) -> np.ndarray:
-    """Return [H, W] bool, where a photo whose data are ``held`` shows what training sees."""
-    shown = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool)
-    if (alpha := held.get("alpha")) is not None:
-        shown &= alpha.cpu() >= OPAQUE
+def _used(view: View, data: dict[str, Tensor], datamanager: BeagsDataManager) -> np.ndarray:
+    """Return [H, W] bool, the pixels of a photo that training uses. data: the view's."""
+    used = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool)
+    if (alpha := data.get("alpha")) is not None:
+        used &= alpha.cpu() >= OPAQUE
     if datamanager.config.photos == "objects" and (labels := view.labels) is not None:
-        shown &= ((labels != BACKGROUND) & (labels != IGNORE)).cpu()
-    return shown.numpy()
+        used &= ((labels != BACKGROUND) & (labels != IGNORE)).cpu()
+    return used.numpy()
 
 
-def _differ(found: Gains) -> bool:
-    """Return whether photos differ in exposure or white balance by more than noise explains."""
-    spread = max(found.spread, found.spread_of_colors)
-    return spread > max(LEAST_SPREAD, CERTAIN * float(np.median(found.noise)))
-
-
-def _lines(found: Gains, names: Sequence[str], learned: bool) -> Iterator[str]:
-    """Yield what the user should know about the photos' gains. learned: whether photos get transforms of their own."""
+def _lines(measured: Gains, names: Sequence[str], learned: bool) -> Iterator[str]:
+    """Yield messages on the photos' gains. learned: whether photos get transforms of their own."""
     if learned:
-        yield _difference(found)
-    if blind := [name for name, noise in zip(names, found.noise, strict=True) if np.isinf(noise)]:
+        means, tinted = measured.stops.mean(axis=1), measured.spread_of_colors
+        balance = f", and their colours by {tinted:.2f} EV besides" if tinted > LEAST_SPREAD else ""
+        yield (
+            f"The photos differ in exposure by {measured.spread:.2f} EV (standard deviation; {means.min():+.2f} to "
+            f"{means.max():+.2f}){balance}: each gets a colour transform of its own, and the scene has the mean "
+            "photo's exposure."
+        )
+    if blind := [name for name, noise in zip(names, measured.noise, strict=True) if np.isinf(noise)]:
         one = len(blind) == 1
         which = f"The photo {blind[0]} shows" if one else f"{len(blind)} photos, the first of them {blind[0]}, show"
         yield (
             f"{which} no point of the scene that is neither black nor burnt out: take {'it' if one else 'them'} out of "
             "the data if nothing can be seen there."
         )
-
-
-def _difference(found: Gains) -> str:
-    """Return the sentence about photos that get transforms."""
-    means = found.stops.mean(axis=1)
-    tinted = found.spread_of_colors
-    balance = f", and their colours by {tinted:.2f} EV besides" if tinted > LEAST_SPREAD else ""
-    return (
-        f"The photos differ in exposure by {found.spread:.2f} EV (standard deviation; {means.min():+.2f} to "
-        f"{means.max():+.2f}){balance}: each gets a colour transform of its own, and the scene has the mean "
-        "photo's exposure."
-    )
-
-
-def _factors(found: Gains) -> np.ndarray:
-    """Return [V, 3], the slopes that gains give to the photos' values, each with a mean of 1 over the photos."""
-    factors = 2.0 ** (found.stops / GAMMA)
-    return factors / factors.mean(axis=0)

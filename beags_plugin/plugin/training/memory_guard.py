@@ -1,4 +1,4 @@
-"""Checks that memory and disk are free, before a run and while it trains."""
+"""Check that memory and disk are free, before a run and while it trains."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.memory import available_mb, memory_mb
 
 LEAST_FREE_MB = 200.0
-"""Memory, and room on each disk, that a training needs to begin, and leaves free; MB of 10^6 bytes."""
+"""Memory, and space on each disk, that must be free to begin and to go on training; MB of 10^6 bytes."""
 
 SMALLER = (
     "train with smaller photos (end the command with beags-data --downscale-factor 2), or bound the Gaussians "
@@ -24,9 +24,9 @@ _ANYWAY = "or try it all the same with --check-memory False (beags resume: --no-
 
 
 def check_room(run: Path, device: str) -> None:
-    """Raise ``UserError`` where hardly any memory or disk is free.
+    """Raise ``UserError`` if hardly any memory or disk is free.
 
-    run: folder of the run. device: "cpu", or another one, whose memory is not checked.
+    run: folder of the run. device: memory is checked for "cpu" alone.
     """
     if device == "cpu" and (left := available_mb()) < LEAST_FREE_MB:
         raise UserError(f"the machine has {left:.0f} MB of memory left: close other programs, {SMALLER}, {_ANYWAY}")
@@ -38,21 +38,21 @@ def check_room(run: Path, device: str) -> None:
 
 
 def free_disk_mb(folder: Path) -> float:
-    """Return the room on the disk of a folder, which may not exist yet; MB of 10^6 bytes."""
+    """Return the free space on the disk of a folder, which need not exist yet; MB of 10^6 bytes."""
     existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
     return shutil.disk_usage(existing).free / 1e6
 
 
 class MemoryWatch:
-    """Watches a training's memory, so that it can be saved before memory runs out."""
+    """Watches memory, so that a training can be saved before it runs out."""
 
-    EVERY = 20  # steps
+    EVERY = 20  # Steps between two checks.
 
     def __init__(self, device: str) -> None:
         self._on = device == "cpu"
 
     def short_of(self, step: int) -> str | None:
-        """Describe the shortage of memory after ``step``; None as long as there is enough."""
+        """Describe the shortage of memory after ``step``; None if there is enough."""
         if not self._on or step % self.EVERY or (left := available_mb()) >= LEAST_FREE_MB:
             return None
         return f"the machine has {left:.0f} MB of memory left, and this training takes {memory_mb():.0f} MB"

@@ -1,4 +1,4 @@
-"""Measurements while a run trains: curves for tensorboard and wandb, and the quality of held-out views."""
+"""Measure a run while it trains: curves for tensorboard and wandb, and the quality of held-out views."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.configs import base_config  # noqa: F401  (the writer, which it imports, cannot come first)
+from nerfstudio.configs import base_config  # noqa: F401  (the writer fails if it is imported before)
 from nerfstudio.utils import writer
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.core.select import select_class
 from beags_plugin.core.surfels import Surfels
@@ -24,26 +23,26 @@ from beags_plugin.evaluation.violations import boundary_errors, occupancy_violat
 from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.labels.colors import colorize
 from beags_plugin.losses.photometric import psnr, ssim
-from beags_plugin.plugin.training.scene_model import SceneModel
+from beags_plugin.plugin.training.scene_model import SceneModel, picture
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.rasterizers.rendering import render_class_map, surfel_inputs
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.memory import memory_mb, peak_memory_mb
-from beags_plugin.system.progress import counted, progress_bar
+from beags_plugin.system.progress import counted, progress_bar, say
 from beags_plugin.system.whole_files import write_text_atomically
 from beags_plugin.views.views import View
 
-MOST_CLASSES = 20  # with a curve and a picture each: the first ones by id
+MOST_CLASSES = 20  # Classes, the first by id, with a curve and a picture each.
 CURVE = "held_out.json"
 """File of a run: one record per measurement, see ``HeldOutCurve``."""
-VIEWS = 4  # held-out views on which masks are measured, spread over all
+VIEWS = 4  # Evenly spaced held-out views on which masks are measured.
 
 
 class Curves:
-    """Writes through nerfstudio's writers, so that tensorboard, wandb and comet all get it.
+    """Writes curves through nerfstudio's writers: to tensorboard, wandb and comet.
 
-    views: held out. every: steps between two measurements of masks and pictures, besides the first and the last step
-    with classes; 0: never. last: number of steps of the run. log_every: steps between two other scalars.
+    views: held out. every: steps between two measurements of masks and pictures, which also happen at the first and the
+    last step with classes; 0: never. last: number of steps of the run. log_every: steps between two other scalars.
     """
 
     def __init__(self, model: SceneModel, views: Sequence[EvalView], every: int, last: int, log_every: int) -> None:
@@ -53,22 +52,22 @@ class Curves:
         self.log_every = log_every
         self._all_views = views
         self._views: list[EvalView] | None = None
-        self._measured = False  # objects, at least once
+        self._measured = False  # Whether objects have been measured.
 
     def state(self) -> dict[str, Any]:
         """Return whether objects have been measured; see ``resumable.Resumable``."""
         return {"measured": self._measured}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on with the measurements of the run that gave ``state``."""
+        """Continue from ``state``."""
         self._measured = state["measured"]
 
     def before_step(self, step: int) -> None:
-        """Measure what a run that was interrupted during the preparation would have measured after the last step."""
-        model = self.model  # whose `assigned` may lie on a GPU: it is not asked before it may be True
-        asked = self.every > 0 and step > 0 and not self._measured and model.schedule.refining(step)
-        asked = asked and model.own_training is None
-        if asked and bool(model.assigned):
+        """Make up for the measurement that an interrupted preparation prevented after the last step."""
+        model = self.model
+        due = self.every > 0 and step > 0 and not self._measured and model.schedule.refining(step)
+        due = due and model.own_training is None
+        if due and bool(model.assigned):  # Read last, because a step must not wait for a GPU.
             self._objects(step - 1)
 
     def after_step(self, step: int) -> None:
@@ -82,13 +81,13 @@ class Curves:
             self._boundaries(step)
         done = step + 1
         due = self.every > 0 and (not self._measured or done % self.every == 0 or done == self.last)
-        its_own = model.own_training is None or done == self.last  # of other refiners only the end is theirs
-        if due and its_own and model.schedule.refining(done) and bool(model.assigned):
+        has_objects = model.own_training is None or done == self.last  # Such a refiner has none before.
+        if due and has_objects and model.schedule.refining(done) and bool(model.assigned):
             self._objects(step)
 
-    def _named(self, found: dict[int, float]) -> dict[str, float]:
+    def _named(self, values: dict[int, float]) -> dict[str, float]:
         names = dict(sorted(self.model.classes.items())[:MOST_CLASSES])
-        return {names[index]: value for index, value in found.items() if index in names}
+        return {names[index]: value for index, value in values.items() if index in names}
 
     def _boundaries(self, step: int) -> None:
         """Write the boundary errors of the training view that was just rendered."""
@@ -110,11 +109,11 @@ class Curves:
         model = self.model
         surfels, members = model.surfels().detach(), model.members()
         if model.grid is not None:
-            found = occupancy_violations(surfels, model.class_ids, model.grid, model.seed, step)
-            found.pop(BACKGROUND, None)  # all that no object has, seen there or not
-            for name, share in self._named(found).items():
+            shares = occupancy_violations(surfels, model.class_ids, model.grid, model.seed, step)
+            shares.pop(BACKGROUND, None)  # It holds every Gaussian of no object, even where nothing was seen.
+            for name, share in self._named(shares).items():
                 writer.put_scalar(f"Occupancy violation/{name}", share, step)
-        views = self._looked_at()
+        views = self._measured_views()
         objects = [index for index in sorted(model.classes)[:MOST_CLASSES] if index != BACKGROUND]
         parts = {index: select_class(surfels, members, index)[0] for index in objects}
         settings = model.settings(geometry=False)
@@ -136,15 +135,14 @@ class Curves:
         if views:
             self._pictures(step, views[0], parts, lambda rendered: progress(done + rendered, total))
 
-    def _looked_at(self) -> list[EvalView]:
-        """Return the held-out views; none if they cannot be read, which is no reason to end a training."""
+    def _measured_views(self) -> list[EvalView]:
+        """Return the held-out views to measure; none if they cannot be read, so that training continues."""
         if self._views is None:
             try:
                 views, count = self._all_views, min(VIEWS, len(self._all_views))
                 self._views = [views[(2 * index + 1) * len(views) // (2 * count)] for index in range(count)]
             except UserError as error:
-                message = f"Extracted IoU and pictures are left out of the curves: {error}"
-                CONSOLE.print(message, style="yellow", markup=False, highlight=False, soft_wrap=True)
+                say(f"Extracted IoU and pictures are left out of the curves: {error}", warning=True)
                 self._views = []
         return self._views
 
@@ -156,21 +154,20 @@ class Curves:
         classes, _ = render_class_map(model.rasterizer, surfels, model.class_ids, camera, settings)
         colors = colorize(classes.cpu().numpy().astype(np.uint16))
         writer.put_image("Scene/class map", torch.from_numpy(colors).float() / 255.0, step)
-        background = model.background_color.to(model.device)
         for rendered, (index, part) in enumerate(parts.items(), start=1):
             progress(rendered)
             if len(part):
-                render = model.rasterizer.rasterize(surfel_inputs(part, camera), camera, settings, background)
-                writer.put_image(f"Objects/{model.classes[index]}", render.color.clamp(0.0, 1.0), step)
+                image = picture(model, surfel_inputs(part, camera), camera)
+                writer.put_image(f"Objects/{model.classes[index]}", image, step)
 
 
 class HeldOutCurve:
-    """Quality against steps, kept in ``<run>/held_out.json``.
+    """Quality against steps, written to ``<run>/held_out.json``.
 
-    A record holds ``step`` (steps done), ``gaussians``, ``psnr`` (dB) and ``ssim`` of the held-out views (means over
-    them), ``train_psnr`` of as many training views spread over all, and ``seconds`` and ``cpu_seconds`` of training so
-    far, without the measurements. Of a scene with exposures of its photos also ``psnr_fit`` and ``train_psnr_fit``,
-    after the affine colour fit of each view. Only colours are rendered: a view costs a fraction of a step.
+    A record holds ``step`` (steps done), ``gaussians``, the means ``psnr`` (dB) and ``ssim`` of the held-out views,
+    ``train_psnr`` of as many evenly spaced training views, and ``seconds`` and ``cpu_seconds`` of training so far,
+    without the measurements. A scene with exposures also has ``psnr_fit`` and ``train_psnr_fit``, after the affine
+    colour fit of each view. Only colours are rendered, so a view costs a fraction of a step.
     """
 
     def __init__(self, folder: Path, every: int, last: int, model: SceneModel, datamanager: BeagsDataManager) -> None:
@@ -191,7 +188,7 @@ class HeldOutCurve:
         return {"records": list(self.records), "clocks": {name: now[name] - self._started[name] for name in now}}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on with the curve of the run that gave ``state``."""
+        """Continue from ``state``."""
         self.records = list(state["records"])
         self._started = {name: now - state["clocks"][name] for name, now in _clocks().items()}
 
@@ -218,16 +215,10 @@ class HeldOutCurve:
     @torch.no_grad()
     def _quality(self, view: View) -> dict[str, float]:
         model = self.model
-        background = model.background_color.to(model.device)
-        image = view.image_on(background)
-        color = model.rasterizer.rasterize(
-            surfel_inputs(model.surfels(), view.camera, model.active_sh_degree()),
-            view.camera,
-            model.settings(geometry=False),
-            background,
-        ).color.clamp(0.0, 1.0)
-        found = {"psnr": float(psnr(color, image)), "ssim": float(ssim(color, image))}
-        return found if model.exposures is None else {**found, "psnr_fit": psnr_after_fit(color, image)}
+        image = view.image_on(model.background_color.to(model.device))
+        color = picture(model, surfel_inputs(model.surfels(), view.camera, model.active_sh_degree()), view.camera)
+        quality = {"psnr": float(psnr(color, image)), "ssim": float(ssim(color, image))}
+        return quality if model.exposures is None else {**quality, "psnr_fit": psnr_after_fit(color, image)}
 
 
 def _clocks() -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Which Gaussians close-ups show on objects: there a base grows by their pixels, elsewhere by those of whole photos."""
+"""Growth near objects: close-ups' pixels bound the Gaussians there, and whole photos' pixels those elsewhere."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 
 MOST = 0.5
-"""Share of the close-ups showing a Gaussian from which on it counts as near, if they show it on objects."""
+"""A Gaussian is near if more than this share of the close-ups that show it show it on an object."""
 
 MORE = 1.2
-"""Bound of all Gaussians with close-ups, in units of that without: they take time."""
+"""Bound of all Gaussians with close-ups, in units of the bound without; more would take too long."""
 
 
 def shared_pixels(whole: int, of_objects: int) -> tuple[int, int]:
@@ -25,7 +25,7 @@ def shared_pixels(whole: int, of_objects: int) -> tuple[int, int]:
 
 
 class NearVotes:
-    """Of N Gaussians, the number of close-ups that show them, and of those that show them on an object."""
+    """For each of N Gaussians, the number of close-ups that show it, and of those that show it on an object."""
 
     def __init__(self, count: int, device: torch.device | str = "cpu") -> None:
         self.shown = torch.zeros(count, device=device)
@@ -42,13 +42,13 @@ class NearVotes:
 
     def of(self, source: Tensor) -> NearVotes:
         """Return the votes of the Gaussians ``source`` [M]."""
-        kept = NearVotes(0)
-        kept.shown, kept.inside = self.shown[source], self.inside[source]
-        return kept
+        votes = NearVotes(0)
+        votes.shown, votes.inside = self.shown[source], self.inside[source]
+        return votes
 
 
 def on_objects(means: Tensor, camera: Camera, labels: Tensor) -> Tensor:
-    """Return [N] bool, the centres [N, 3] that the camera sees, or would see, in a pixel of an object.
+    """Return [N] bool, the centres [N, 3] that project into a pixel of an object, hidden or not.
 
     labels: [H, W] int32 of the camera's image.
     """
@@ -56,5 +56,5 @@ def on_objects(means: Tensor, camera: Camera, labels: Tensor) -> Tensor:
     projected = local @ camera.K.T
     columns, rows = (projected[:, :2] / projected[:, 2:]).nan_to_num(-1.0, -1.0, -1.0).floor().long().unbind(dim=1)
     inside = (local[:, 2] > 0) & (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
-    found = labels[rows.clamp(0, camera.height - 1), columns.clamp(0, camera.width - 1)]
-    return inside & (found != BACKGROUND) & (found != IGNORE)
+    ids = labels[rows.clamp(0, camera.height - 1), columns.clamp(0, camera.width - 1)]
+    return inside & (ids != BACKGROUND) & (ids != IGNORE)

@@ -11,7 +11,7 @@ from torch.nn import Parameter
 
 from beags_plugin.plugin.training.timing import StepClock
 
-SCENE = "scene"  # name of the one optimizer, for nerfstudio and in checkpoints
+SCENE = "scene"  # Name of the one optimizer in nerfstudio and in checkpoints.
 
 
 class SceneOptimizer(Optimizers):
@@ -38,7 +38,7 @@ class SceneOptimizer(Optimizers):
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
         """Clip the gradients of groups whose config says so, and step."""
         self.clock.mark("backward")
-        groups = self.adam.param_groups  # not `self.parameters`: those are the ones that training began with
+        groups = self.adam.param_groups  # self.parameters holds only the first step's.
         norms = {group["name"]: self.config[group["name"]]["optimizer"].max_norm for group in groups}
         if any(norm is not None for norm in norms.values()):
             grad_scaler.unscale_(self.adam)

@@ -1,4 +1,4 @@
-"""The files of a preparation, with which a resumed refinement goes on."""
+"""The files of a preparation, from which a resumed refinement continues."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from beags_plugin.system.whole_files import write_text_atomically, write_whole
 def save_prepared(prepared: Preparation, names: list[str], folder: Path, fit: Residuals | None = None) -> None:
     """Write what a resumed refinement needs; grid.pt comes last, as its presence marks the rest as complete.
 
-    fit: of the base to the photos, for the report, where it was measured.
+    fit: of the base to the photos, for the report; None if it was not measured.
     """
     with writing(folder):
-        (folder / "grid.pt").unlink(missing_ok=True)  # an earlier run's
+        (folder / "grid.pt").unlink(missing_ok=True)
         clear(folder)
         (folder / "masks").mkdir(parents=True, exist_ok=True)
         (folder / "confidence").mkdir(exist_ok=True)
@@ -36,7 +36,7 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path, fit: Re
             write_mask(folder / "masks" / f"{name}.png", labels.cpu().numpy().astype(np.uint16))
             if prepared.confidence is not None:
                 path = folder / "confidence" / f"{name}.png"
-                with writing(path):  # cv2 would ignore a full disk
+                with writing(path):  # PIL is used because cv2 ignores a full disk.
                     Image.fromarray(prepared.confidence[index].cpu().numpy()).save(path)
     report = {"summary": prepared.summary, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
     if prepared.agreement is not None:

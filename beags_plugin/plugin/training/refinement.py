@@ -1,16 +1,14 @@
-"""The switch from base training to refinement, and its files for a resume."""
+"""The switch from base training to refinement, also in a resumed run."""
 
 from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from threading import Lock
 from typing import Any
-
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.assignment.assignment import Assignment
 from beags_plugin.core.membership import Membership
@@ -30,9 +28,10 @@ from beags_plugin.runs.layout import BASE_SNAPSHOT, PREPARED
 from beags_plugin.runs.prepared import prepared_labels, read_grid
 from beags_plugin.runs.write import write_run
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.progress import counted, progress_bar
+from beags_plugin.system.progress import counted, progress_bar, say
+from beags_plugin.views.views import View
 
-NOTHING_TO_SAVE = -1  # instead of a step
+NOTHING_TO_SAVE = -1  # It stands for no step.
 
 
 class RefinementSwitch:
@@ -43,21 +42,21 @@ class RefinementSwitch:
         self.trainer = trainer
         self.datamanager = datamanager
         self.refiner = make_refiner(model.config.refiner, model.config.refiner_options)
-        self._own_state: dict[str, Any] | None = None  # of a loaded checkpoint
-        self.ready = False  # to refine
-        self._switching = False  # in the middle of the last base step, before nerfstudio evaluates and saves it
+        self._own_state: dict[str, Any] | None = None  # ``own_training``'s in a loaded checkpoint.
+        self.ready = False  # Whether refinement can begin.
+        self._switching = False  # True in the last base step, until nerfstudio evaluates and saves it.
         self._evaluation_due = False
-        self.prepared = False  # A run that is resumed may have done it before.
+        self.prepared = False  # A resumed run may have been prepared before.
         model.prepared = False
 
     @property
-    def wanted(self) -> bool:
-        """True if this run refines at all."""
+    def refines(self) -> bool:
+        """Return whether this run refines at all."""
         return self.model.schedule.refine_steps > 0
 
     def ask_steps(self) -> None:
-        """Ask the refiner for the number of its steps, which may follow from the data."""
-        if not self.wanted:
+        """Set the number of refinement steps, which the refiner may compute from the data."""
+        if not self.refines:
             return
         self.refiner.check(self.model.classes)
         schedule, views = self.model.schedule, len(self.datamanager.train_dataset)
@@ -66,10 +65,10 @@ class RefinementSwitch:
         self.trainer.reschedule(self.model.schedule)
 
     def check(self) -> None:
-        """Raise ``UserError`` for options and masks that would stop the run when it begins to refine."""
+        """Raise ``UserError`` for options and masks with which refinement could not begin."""
         config = self.model.config
         if self.refiner.joins_base and config.base_steps == 0:
-            raise UserError("the refiner's option joint trains a base of its own: set base_steps, and load none.")
+            raise UserError("the refiner's option joint trains a base of its own: set base_steps, and load no base.")
         if config.refine_steps > 0:
             config.prepare.check()
         if config.refine_steps > 0 or self.refiner.joins_base:
@@ -78,18 +77,18 @@ class RefinementSwitch:
     def state(self) -> dict[str, Any]:
         """Return whether refinement is prepared, and nerfstudio has evaluated the step; see ``Resumable``."""
         own = self.model.own_training
-        kept = {} if own is None else {"own": own.state(), "refiner": self._refiner_in_words()}
-        return {"prepared": self.prepared, "evaluated": not self._switching, **kept}
+        of_refiner = {} if own is None else {"own": own.state(), "refiner": self._refiner_in_words()}
+        return {"prepared": self.prepared, "evaluated": not self._switching, **of_refiner}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from ``state``."""
+        """Continue from ``state``."""
         self.prepared = state["prepared"]
         self._evaluation_due = not state["evaluated"]
         self._own_state = state.get("own")
         now, began = self._refiner_in_words(), state.get("refiner")
         if self.prepared and began != (None if self.refiner.leaves_base or self.refiner.trains else now):
             raise UserError(
-                f"refinement began with the refiner {began or 'bea or none'}, not with {now}: go on with that, or "
+                f"refinement began with the refiner {began or 'bea or none'}, not with {now}: continue with that, or "
                 f"refine again from {BASE_SNAPSHOT}/nerfstudio_models."
             )
 
@@ -100,11 +99,11 @@ class RefinementSwitch:
         )
 
     def before_step(self, step: int) -> None:
-        """Restore refinement from a checkpoint, or start it where no base step precedes it; or join the base."""
+        """Join the base; restore refinement from a checkpoint, or start it if no base step precedes it."""
         model = self.model
         if self.refiner.joins_base and model.own_training is None:
             self._join_base()
-        if not self.wanted or not model.schedule.refining(step):
+        if not self.refines or not model.schedule.refining(step):
             return
         if not self.ready:
             if self.prepared or int(model.refined_steps) > 0:
@@ -114,7 +113,7 @@ class RefinementSwitch:
         if self._evaluation_due:
             self.trainer.eval_iteration(step - 1)
             self._evaluation_due = False
-        if self._closes_after(step):  # which may take minutes: what was trained before is on disk by then
+        if self._closes_after(step):  # That may take minutes, so the training is saved before.
             with self.trainer.long_stage(step - 1):
                 pass
         model.refined_steps += 1
@@ -122,32 +121,32 @@ class RefinementSwitch:
             self._edit(lambda: own.before_step(step - model.schedule.base_steps))
 
     def after_step(self, step: int) -> None:
-        """Switch right after the last base step, so that a run that ends there has its classes too."""
+        """Switch to refinement right after the last base step, so that a run that ends there has classes too."""
         own, refined = self.model.own_training, step - self.model.schedule.base_steps
         if own is not None and refined >= 0:
             self._edit(lambda: own.after_step(refined))
             if refined + 1 == self.model.schedule.refine_steps:
                 self._finish(own)
             elif step + 1 == self.trainer.last_step:
-                CONSOLE.print(
+                say(
                     f"The refiner {self.model.config.refiner} was stopped before its end: the objects are those of "
                     "assignment, not yet its own.",
-                    style="yellow", highlight=False, markup=False, soft_wrap=True,
-                )  # fmt: skip
+                    warning=True,
+                )
         if self._closes_after(step):
             self._close_contacts()
-        if self.wanted and not self.ready and step + 1 == self.model.schedule.base_steps:
+        if self.refines and not self.ready and step + 1 == self.model.schedule.base_steps:
             self._switching = True
             self._prepare(step)
             self._switching = False
 
-    def _edit(self, asked: Callable[[], Edit | None]) -> None:
-        with released(self.trainer.train_lock):  # it may take minutes
-            edit = asked()
+    def _edit(self, make: Callable[[], Edit | None]) -> None:
+        with released(self.trainer.train_lock):  # Making it may take minutes.
+            edit = make()
         apply_edit(self.model, self.trainer.optimizers.adam, edit)
 
     def _finish(self, own: OwnTraining) -> None:
-        """Change the scene as its refiner does in the end, and take the objects from it."""
+        """Apply the refiner's last edit, and take its objects."""
         self._edit(own.last_edit)
         with released(self.trainer.train_lock):
             members = own.finish()
@@ -160,7 +159,7 @@ class RefinementSwitch:
         return model.config.close_contacts and by_losses and step == last
 
     def _close_contacts(self) -> None:
-        """Add the Gaussians that close objects where others hid them; without them if that fails."""
+        """Add the Gaussians that close objects where others hid them; if that fails, warn and leave them open."""
         try:
             with (
                 self.trainer.long_stage(NOTHING_TO_SAVE),
@@ -169,27 +168,26 @@ class RefinementSwitch:
             ):
                 edit, line = close_contacts(self.model, self.datamanager, progress)
             apply_edit(self.model, self.trainer.optimizers.adam, edit)
-            CONSOLE.print(f"  {line}", highlight=False, markup=False)
-        except Exception as error:  # of meshes, say: the scene is trained, and whole without these Gaussians
+            say(f"  {line}")
+        except Exception as error:  # The scene is trained, and complete without these Gaussians.
             reason = str(error).partition("\n")[0]
-            CONSOLE.print(
-                f"Objects stay open where others hide them, as closing them failed ({reason}): "
-                "beags export has --close.",
-                style="yellow", highlight=False, markup=False, soft_wrap=True,
-            )  # fmt: skip
+            say(
+                f"Objects stay open where others hide them, as closing them failed ({reason}): beags export has "
+                "--close.",
+                warning=True,
+            )
 
     def _prepare(self, step: int) -> None:
-        """Prepare refinement from the scene as it is and the masks of the data. step: the last one done."""
+        """Prepare refinement from the present scene and the masks of the data. step: the last one done."""
         model = self.model
-        CONSOLE.rule("Preparing refinement")
+        say("Preparing refinement")
         start = time.perf_counter()
         with self.trainer.long_stage(step):
             whole = self.datamanager.views("train", original=True)
             views = [*whole, *self.datamanager.close_up_views()]
-            with progress_bar("Reading masks", passing=True) as progress:
-                masks = LabelMaps(view.labels for view in counted(views, len(views), progress))
+            masks = _labels(views)
             fit = residuals(model, whole, masks[: len(whole)]) if self.datamanager.config.photos == "all" else None
-            with released(self.trainer.train_lock):  # minutes, which only read the scene: a viewer may render it
+            with released(self.trainer.train_lock):  # For minutes the scene is only read, so a viewer may render it.
                 prepared = prepare(
                     model.surfels(),
                     [view.camera for view in views],
@@ -205,15 +203,15 @@ class RefinementSwitch:
                     stage=progress_bar,
                 )
             for line in prepared.summary:
-                CONSOLE.print(f"  {line}", highlight=False, markup=False)
+                say(f"  {line}")
             self._take_classes(prepared.assignment)
-            snapshot = self.trainer.base_dir / BASE_SNAPSHOT  # before save_prepared, whose last file marks all as there
+            snapshot = self.trainer.base_dir / BASE_SNAPSHOT  # The last file of save_prepared marks it as complete.
             write_run(self.trainer.config, snapshot, model.state_dict(), max(step, 0))
-            CONSOLE.print(f"  base kept in {snapshot}", highlight=False, markup=False, soft_wrap=True)
+            say(f"  base kept in {snapshot}")
             if fit is not None and fit.contradict:
-                CONSOLE.print(fit.sentence(), style="yellow", highlight=False, markup=False, soft_wrap=True)
+                say(fit.sentence(), warning=True)
             save_prepared(prepared, [view.name for view in views], self.trainer.base_dir / PREPARED, fit)
-            if prepared.members is not None:  # beyond the classes, which base/ keeps alone
+            if prepared.members is not None:  # Set after base/ is written, which holds the classes alone.
                 model.take_members(prepared.members)
             self._start(prepared.grid, prepared.labels)
         self.trainer.seconds.prepared(prepared.seconds, time.perf_counter() - start)
@@ -223,7 +221,7 @@ class RefinementSwitch:
 
     def _take_classes(self, assignment: Assignment) -> None:
         self.model.class_ids.copy_(assignment.class_ids)
-        self.model.objects = None  # of another refiner, that the base came from
+        self.model.objects = None  # A loaded base may have another refiner's.
         self.model.class_margin.copy_(assignment.margin)
         self.model.assigned.fill_(True)
 
@@ -240,10 +238,8 @@ class RefinementSwitch:
         self.model.prepared = self.prepared = self.ready = True
 
     def _join_base(self) -> None:
-        views = self.datamanager.views("train")
-        with progress_bar("Reading masks", passing=True) as progress:
-            scene = self._scene(LabelMaps(view.labels for view in counted(views, len(views), progress)))
-        if not bool(self.model.assigned):  # those of a resumed run have their classes
+        scene = self._scene(_labels(self.datamanager.views("train")))
+        if not bool(self.model.assigned):  # A resumed run has its classes already.
             self.model.take_members(Membership(self.refiner.seed_classes(scene)))
         self._own_training(scene)
 
@@ -289,8 +285,8 @@ class RefinementSwitch:
         grid = read_grid(folder / "grid.pt")
         if grid is not None and self._background_voxels() and not bool((grid.classes == 0).any()):
             raise UserError(
-                f"{folder / 'grid.pt'} has no voxels of the background, which a loss now asks about: set background of "
-                f"the occupancy loss to False, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
+                f"{folder / 'grid.pt'} has no voxels of the background, which a loss now needs: set background of "
+                f"the occupancy loss to 0, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
             )
         views = [*self.datamanager.views("train"), *self.datamanager.close_up_views()]
         with progress_bar("Reading masks", passing=True) as progress:
@@ -300,7 +296,12 @@ class RefinementSwitch:
             )
         self._start(grid, labels)
         self.trainer.seconds.refining()
-        CONSOLE.print(f"  refinement taken up from {folder}", highlight=False, markup=False, soft_wrap=True)
+        say(f"  refinement continues from {folder}")
+
+
+def _labels(views: Sequence[View]) -> LabelMaps:
+    with progress_bar("Reading masks", passing=True) as progress:
+        return LabelMaps(view.labels for view in counted(views, len(views), progress))
 
 
 @contextmanager

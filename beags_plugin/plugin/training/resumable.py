@@ -1,4 +1,4 @@
-"""State that a checkpoint keeps besides the scene and its optimizers."""
+"""State that a checkpoint holds besides the scene and its optimizers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from beags_plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
@@ -18,29 +17,30 @@ from beags_plugin.plugin.training.optimizers import SceneOptimizer
 from beags_plugin.plugin.training.timing import StageSeconds
 from beags_plugin.runs.checkpoint_file import scene_alone
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.progress import say
 
-STATE = "beags"  # key of a checkpoint, beside nerfstudio's own
-VERSION = 1  # of the state there
+STATE = "beags"  # Key in a checkpoint, beside nerfstudio's own.
+VERSION = 1  # Version of the state under that key.
 
 
 class Resumable(Protocol):
     """A part of the training whose state a checkpoint holds: tensors and plain values, as ``torch.load`` allows."""
 
     def state(self) -> dict[str, Any]:
-        """Return what decides how the part goes on."""
+        """Return the state that the next steps depend on."""
         ...
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on as the part that gave ``state`` would have."""
+        """Continue from ``state``, as returned by ``state()``."""
         ...
 
 
 class TrainingRun(Protocol):
-    """The trainer as the parts of a training see it.
+    """The trainer as the parts of a training see it; ``BeagsTrainer`` describes the methods.
 
-    run: folder of the run, also in processes that write elsewhere; base_dir: folder that this process writes to.
-    loaded_run: folder of the run that this one resumes. last_step: number of steps of the run. seconds: of its stages.
-    optimizers: of the scene. train_lock: nerfstudio's, held during a step, so that the viewer waits.
+    base_dir: folder of the run. loaded_run: folder of the run that this one resumes. last_step: number of steps of the
+    run. seconds: of its stages. optimizers: of the scene. train_lock: nerfstudio's, held during a step, so that the
+    viewer waits.
     """
 
     config: BeagsTrainerConfig
@@ -51,30 +51,17 @@ class TrainingRun(Protocol):
     train_lock: Lock
 
     @property
-    def run(self) -> Path: ...
-
-    @property
     def loaded_run(self) -> Path | None: ...
 
-    def reschedule(self, schedule: PhaseSchedule) -> None:
-        """Take the steps of this run, which some refiners tell from the data."""
-        ...
+    def reschedule(self, schedule: PhaseSchedule) -> None: ...
 
-    def keep(self, name: str, part: Resumable) -> None:
-        """Let checkpoints hold the state of ``part``."""
-        ...
+    def keep(self, name: str, part: Resumable) -> None: ...
 
-    def stop_if_asked(self, step: int) -> None:
-        """End the training before ``step`` if a signal asked for that, or memory is running out."""
-        ...
+    def stop_if_requested(self, step: int) -> None: ...
 
-    def long_stage(self, step: int) -> AbstractContextManager[None]:
-        """Enclose a long stage after ``step``, which an interruption ends at once."""
-        ...
+    def long_stage(self, step: int) -> AbstractContextManager[None]: ...
 
-    def eval_iteration(self, step: int) -> None:
-        """Evaluate as nerfstudio does after ``step``."""
-        ...
+    def eval_iteration(self, step: int) -> None: ...
 
 
 class GlobalRandom:
@@ -82,7 +69,7 @@ class GlobalRandom:
 
     def state(self) -> dict[str, Any]:
         """Return the generators' states; see ``Resumable``."""
-        numpy_state: Any = np.random.get_state()  # noqa: NPY002  (that of others)
+        numpy_state: Any = np.random.get_state()  # noqa: NPY002  (other packages use it)
         name, keys, *rest = numpy_state
         return {"torch": torch.get_rng_state(), "python": random.getstate(), "numpy": (name, keys.tolist(), *rest)}
 
@@ -95,7 +82,7 @@ class GlobalRandom:
 
 
 def training_state(checkpoint: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return the states of all parts of the training by name; none, with a note, for an older checkpoint.
+    """Return the states of all parts of the training by name; none, after a message, for an older checkpoint.
 
     Raises ``UserError`` for a checkpoint of a newer version, or a damaged one.
     """
@@ -111,10 +98,9 @@ def training_state(checkpoint: dict[str, Any], path: Path) -> dict[str, Any]:
         )
     if state is None or state["version"] < VERSION:
         if not scene_alone(checkpoint):
-            CONSOLE.print(
-                f"{path} was saved by an older version of beags, which kept neither the order of the views nor what "
-                "growth had gathered: training goes on, but not bit for bit as without the break.",
-                highlight=False, markup=False, soft_wrap=True,
-            )  # fmt: skip
+            say(
+                f"{path} was saved by an older version of beags, without the order of the views and the statistics of "
+                "growth: training continues, but not bit for bit as without the break."
+            )
         return {}
     return state["parts"]

@@ -1,4 +1,4 @@
-"""Edits of the scene while it trains: parameters change in number, and Adam's moments follow them."""
+"""Edit the scene while it trains: Gaussians change in number, and Adam's moments follow them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def edit_scene(model: SceneModel, adam: Adam, edited: Densified) -> None:
 
 
 def apply_edit(model: SceneModel, adam: Adam, edit: Edit | None) -> None:
-    """Change the scene and its optimizer as a refiner asks."""
+    """Apply a refiner's edit to the scene and its optimizer."""
     if edit is None:
         return
     if edit.edited is not None:

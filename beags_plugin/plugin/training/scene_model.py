@@ -22,19 +22,19 @@ from beags_plugin.plugin.options.model_options import BeagsModelConfig
 from beags_plugin.plugin.training.timing import StepClock
 from beags_plugin.preparation.refiner_training import OwnTraining
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
+from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs
 from beags_plugin.runs.checkpoint_file import exposures_of, extra_state
 
 PARAMETER_GROUPS = ("means", "features_dc", "features_rest", "opacities", "scales", "quats")
-FLATNESS = 1e-3  # exported third scale, relative to the smaller of the two: flat, yet no viewer divides by 0
+FLATNESS = 1e-3  # Exported third scale, relative to the smaller of the two: flat, but no viewer divides by 0.
 
 
 @dataclass(frozen=True)
 class LastRender:
     """The render of the last training step.
 
-    screen_shift: [N, 2] of ``SurfelInputs``, whose gradient densification reads. labels: [H, W] int32 of the view, from
-    ``BeagsDataManager``; None if the data gives none. close_up: whether it is of a close-up.
+    screen_shift: [N, 2] of ``SurfelInputs``; densification reads its gradient. labels: [H, W] int32 of the view; None
+    if it has no mask. close_up: whether the view is a close-up.
     """
 
     camera: Camera
@@ -47,29 +47,28 @@ class LastRender:
 class SceneModel(SplatfactoModel):
     """N Gaussians as parameters, their classes as buffers, and the state of the run that trains them.
 
-    It derives from nerfstudio's ``SplatfactoModel``, whose type ns-export and the viewer ask for; its training is not
-    used.
+    It derives from nerfstudio's ``SplatfactoModel``, because ns-export and the viewer check for that type; its training
+    is not used.
 
     classes: id to name. objects: see ``Membership``. step, seed: of the run. grid: voxels of the classes; None before
     refinement. growing: whether this step gathers gradients for densification. frozen: whether the refiner leaves the
     scene as it is. own_training: of a refiner that makes its steps itself. last_render: of the last training step.
-    measuring: whether anyone reads this step's metrics. prepared: whether this run has prepared its
-    refinement; None for a scene that is only looked at. exposures: of the training photos; None where they have one,
-    that of the scene. photo_colors: makes colours [N, 3] those that a training photo shows, by its index; None where
-    they are the scene's. crop_box: nerfstudio's.
+    measuring: whether this step's metrics are read. prepared: whether this run has prepared its refinement; None
+    outside training. exposures: of the training photos; None if all have the same. photo_colors: turns colours [N, 3]
+    of the scene into those of a training photo, by its index; None without exposures. crop_box: nerfstudio's.
     """
 
     config: BeagsModelConfig
     classes: dict[int, str]
-    # buffers, for type checkers
+    # These are buffers, declared for type checkers.
     class_ids: Tensor  # [N] int32
     class_margin: Tensor  # [N] float32
     assigned: Tensor  # [] bool
     extent: Tensor  # [] float32, world units
-    refined_steps: Tensor  # [] int64, refinement steps that the scene has been through
+    refined_steps: Tensor  # [] int64, refinement steps of the scene so far
 
     def hold(self, surfels: Surfels, classes: Mapping[int, str]) -> None:
-        """Make the parameters and buffers of a scene whose Gaussians have no classes yet; called once."""
+        """Create the parameters and buffers of a scene without classes; called once."""
         self.gauss_params = nn.ParameterDict({name: nn.Parameter(value) for name, value in _by_group(surfels).items()})
         self.register_buffer("class_ids", torch.zeros(len(surfels), dtype=torch.int32))
         self.register_buffer("class_margin", torch.zeros(len(surfels)))
@@ -104,7 +103,7 @@ class SceneModel(SplatfactoModel):
     # -- what is rendered, and how -----------------------------------------------------------------------------------
 
     def extent_on_host(self) -> float:
-        """Return ``extent``, world units; it is fetched from a GPU once only, lest every step wait for it."""
+        """Return ``extent``, world units; it is fetched from a GPU only once, so that no step waits for it."""
         known = self._known_extent
         if known is None or known[0] is not self.extent or known[1] != self.extent._version:
             self._known_extent = known = (self.extent, self.extent._version, float(self.extent))
@@ -116,7 +115,7 @@ class SceneModel(SplatfactoModel):
         return RasterSettings(self.config.near * extent, self.config.far * extent, geometry, distortion)
 
     def active_sh_degree(self) -> int:
-        """Return the SH degree to render: it grows one by one while the base trains; else all are rendered."""
+        """Return the SH degree to render: while the base trains it grows by one at a time up to the full degree."""
         if not self.training or self.schedule.warm or self.schedule.refining(self.step):
             return self.config.sh_degree
         interval = max(self.schedule.scaled(self.config.sh_degree_interval), 1)
@@ -126,28 +125,28 @@ class SceneModel(SplatfactoModel):
         """Return the terms that count at the current step."""
         if self.frozen:
             return {}
-        of_base = self.own_training is not None
+        skips_refine = self.own_training is not None
         return {
             name: loss
             for name, loss in self.losses.items()
-            if loss.active(self.step) and not (of_base and self.config.losses[name].phase == "refine")
+            if loss.active(self.step) and not (skips_refine and self.config.losses[name].phase == "refine")
         }
 
     def generator(self, step: int) -> torch.Generator:
-        """Return a generator seeded by (seed, step), so that a resumed run samples as the uninterrupted one."""
+        """Return a generator seeded by (seed, step), so that a resumed run draws the same numbers."""
         return torch.Generator().manual_seed(self.seed * 1_000_003 + step)
 
     # -- Gaussians ---------------------------------------------------------------------------------------------------
 
     @property
     def scales(self) -> Tensor:
-        """[N, 3] logs of the scales for exporters: the third is thin; the parameter itself has two."""
+        """[N, 3] logs of the scales for exporters; the third, which the parameter lacks, is thin."""
         flat = self.gauss_params["scales"]
         thin = flat.min(dim=-1, keepdim=True).values + torch.log(flat.new_tensor(FLATNESS))
         return torch.cat([flat, thin], dim=-1)
 
     def surfels(self) -> Surfels:
-        """Return the scene; it shares storage (and gradients) with the parameters."""
+        """Return the scene; it shares storage and gradients with the parameters."""
         return Surfels(
             means=self.gauss_params["means"],
             quats=self.gauss_params["quats"],
@@ -162,7 +161,7 @@ class SceneModel(SplatfactoModel):
         return Membership(self.class_ids, self.objects)
 
     def take_members(self, members: Membership) -> None:
-        """Take the classes of all Gaussians."""
+        """Set the classes of all Gaussians."""
         self.class_ids = members.class_ids.int().to(self.device)
         self.objects = members.objects
         self.assigned.fill_(True)
@@ -170,9 +169,8 @@ class SceneModel(SplatfactoModel):
     def replace_surfels(self, surfels: Surfels) -> None:
         """Replace all parameters, in any number and SH degree; classes are reset."""
         self.config.sh_degree = surfels.sh_degree
-        for name, value in _by_group(
-            surfels
-        ).items():  # new ones: autograd keeps the size of those in the last step's graph
+        # The parameters are new objects, because autograd keeps the size of those in the last step's graph.
+        for name, value in _by_group(surfels).items():
             self.gauss_params[name] = nn.Parameter(value.detach().to(self.device).contiguous())
         self._reset_classes(len(surfels))
 
@@ -182,7 +180,7 @@ class SceneModel(SplatfactoModel):
         self.objects = None
 
     def take_classes(self, classes: Mapping[int, str]) -> None:
-        """Take other classes, of which no Gaussian has one yet."""
+        """Set other classes; no Gaussian has one of them yet."""
         self.classes = dict(classes)
         self._reset_classes(self.num_points)
         self.assigned.fill_(False)
@@ -191,7 +189,7 @@ class SceneModel(SplatfactoModel):
 
     def load_state_dict(self, state: Mapping[str, Any], **kwargs) -> Any:
         """Load a checkpoint of any number of Gaussians; parameters are resized in place (optimizers hold them)."""
-        # colours are rendered as they were trained, whatever SH degree this config asks for
+        # Colours are rendered with the SH degree of their training, whatever this config says.
         self.config.sh_degree = round((state["gauss_params.features_rest"].shape[1] + 1) ** 0.5) - 1
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.zeros_like(state[f"gauss_params.{name}"], device=self.device)
@@ -199,11 +197,11 @@ class SceneModel(SplatfactoModel):
         return nn.Module.load_state_dict(self, state, **kwargs)  # type: ignore[arg-type]
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return what a checkpoint keeps besides tensors by name: class names, objects and exposures."""
+        """Return the checkpoint's content besides tensors by name: class names, objects and exposures."""
         return extra_state(self.classes, self.members(), self.exposures)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take the class names, objects and exposures of a checkpoint."""
+        """Set class names, objects and exposures from a checkpoint."""
         self.classes = {int(index): str(name) for index, name in state["classes"].items()}
         self.objects = state.get("objects")
         self.exposures = exposures_of(state)
@@ -211,6 +209,12 @@ class SceneModel(SplatfactoModel):
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return one optimizer group per kind of parameter."""
         return {name: [self.gauss_params[name]] for name in PARAMETER_GROUPS}
+
+
+def picture(model: SceneModel, inputs: SurfelInputs, camera: Camera) -> Tensor:
+    """Render colours [H, W, 3] in 0..1 of Gaussians on the scene's background."""
+    background, settings = model.background_color.to(model.device), model.settings(geometry=False)
+    return model.rasterizer.rasterize(inputs, camera, settings, background).color.clamp(0.0, 1.0)
 
 
 def _by_group(surfels: Surfels) -> dict[str, Tensor]:

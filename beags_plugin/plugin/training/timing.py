@@ -5,31 +5,28 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from nerfstudio.utils.rich_utils import CONSOLE
+from beags_plugin.system.progress import say
 
 QUICKEST = "beags-tiny"
 QUICKER = f"Quicker: ns-train {QUICKEST}, or end the command with: beags-data --downscale-factor 2."
-LONG_RUN_SECONDS = 20 * 60  # an expected time above this prints which preset is quicker
-ESTIMATE_STEPS = (20, 120)  # the estimate is the mean step between these, after warm-up
+LONG_RUN_SECONDS = 20 * 60  # If a run is expected to take longer, the message names a quicker preset.
+ESTIMATE_STEPS = (20, 120)  # The estimate is the mean step between these, after warm-up.
 
 
 class Estimate:
     """The expected time of ``steps`` steps of a method, printed once.
 
-    chosen: the method was chosen for this run, as not in a resumed one; a quicker one is named then.
+    chosen: whether the user could still choose another method, as in a new run; then a quicker one is named.
     """
 
     def __init__(self, method: str, steps: int, chosen: bool = True) -> None:
         self._steps = steps
         self._quicker = f" {QUICKER}" if chosen and method != QUICKEST else ""
         self._from = 0.0
-        CONSOLE.print(
-            f"{method}: {steps} steps; how long they take is said after {ESTIMATE_STEPS[1]} of them.{self._quicker}",
-            highlight=False,
-        )
+        say(f"{method}: {steps} steps; a line after {ESTIMATE_STEPS[1]} tells how long they take.{self._quicker}")
 
     def before_step(self, done: int) -> None:
-        """Take the time before a step. done: steps of this process so far."""
+        """Measure the time before a step. done: steps of this process so far."""
         first, last = ESTIMATE_STEPS
         if done == first:
             self._from = time.perf_counter()
@@ -44,11 +41,11 @@ class Estimate:
         )
         if left > LONG_RUN_SECONDS:
             message += self._quicker
-        CONSOLE.print(message, highlight=False)
+        say(message)
 
 
 class StageSeconds:
-    """The wall times of base training, each preparation stage and refinement; a resumed run counts on."""
+    """The wall times of base training, each preparation stage and refinement; a resumed run adds to them."""
 
     def __init__(self) -> None:
         self._started = time.perf_counter()
@@ -58,16 +55,16 @@ class StageSeconds:
         self._refining_since = 0.0
 
     def start(self) -> None:
-        """Begin to count: the run trains from here on."""
+        """Begin to count."""
         self._started = time.perf_counter()
 
     def prepared(self, stages: dict[str, float], seconds: float) -> None:
-        """Begin to count refinement, after a preparation of ``seconds``, with those of its stages."""
+        """Begin to count refinement, after a preparation of ``seconds`` with the seconds of its stages."""
         self._preparing, self._stages = seconds, dict(stages)
         self._refining_since = time.perf_counter()
 
     def refining(self) -> None:
-        """Begin to count refinement that another process has prepared."""
+        """Begin to count refinement without a preparation in this process."""
         self._refining_since = time.perf_counter()
 
     def total(self) -> dict[str, float]:
@@ -84,12 +81,12 @@ class StageSeconds:
         return self.total()
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Count on from ``state``."""
+        """Continue from ``state``."""
         self._former = dict(state)
 
 
 class StepClock:
-    """The seconds per part of a step: each lasts from the mark before to its own."""
+    """Seconds per part of a step; a part lasts from the former mark to its own."""
 
     def __init__(self) -> None:
         self._last = time.perf_counter()
@@ -108,14 +105,14 @@ class StepClock:
         self._last = now
 
     def skip(self) -> None:
-        """Count the time since the last mark to no part."""
+        """Assign the time since the last mark to no part."""
         self._last = time.perf_counter()
 
     def means(self) -> dict[str, float]:
         """Return the seconds per step of each part, since the last call."""
         steps, self._steps = max(self._steps, 1), 0
-        found, self._seconds = {part: seconds / steps for part, seconds in self._seconds.items()}, {}
-        return found
+        means, self._seconds = {part: seconds / steps for part, seconds in self._seconds.items()}, {}
+        return means
 
 
 def _duration(seconds: float) -> str:

@@ -18,13 +18,13 @@ from beags_plugin.surfaces.frames import bounding_box
 if TYPE_CHECKING:
     from viser import ClientHandle
 
-_WORLD = 10.0  # viser's units in one of nerfstudio's: VISER_NERFSTUDIO_SCALE_RATIO, whose module is slow to import
-_MARGIN = 1.1  # discs reach beyond their box
+WORLD = 10.0  # Viser's units in one of nerfstudio's: VISER_NERFSTUDIO_SCALE_RATIO, whose module is slow to import.
+_MARGIN = 1.1  # Gaussians reach beyond the box of their centres.
 
 
-def frame_of(surfels: Surfels, members: Membership, wanted: Sequence[int], cameras: Sequence[Camera]) -> OrbitFrame:
-    """Return the place of the box around the Gaussians of the ``wanted`` classes; each must have some."""
-    boxes = [bounding_box(surfels[members.of(class_id)]) for class_id in wanted]
+def frame_of(surfels: Surfels, members: Membership, class_ids: Sequence[int], cameras: Sequence[Camera]) -> OrbitFrame:
+    """Return the frame of the box around the Gaussians of these classes; each must have some."""
+    boxes = [bounding_box(surfels[members.of(class_id)]) for class_id in class_ids]
     low, high = torch.stack([box[0] for box in boxes]), torch.stack([box[1] for box in boxes])
     return orbit_frame(low.amin(dim=0), high.amax(dim=0), cameras)
 
@@ -37,9 +37,9 @@ def side_of_photos(frame: OrbitFrame, cameras: Sequence[Camera]) -> Tensor:
 
 
 def place(frame: OrbitFrame, away: Tensor, fov: float, aspect: float) -> Tensor:
-    """Return [3], where a camera that looks at the frame's centre from the side ``away`` has all of its box in view.
+    """Return [3], the position in direction ``away`` from which a camera sees all of the frame's box.
 
-    fov: of the height, radians. aspect: width over height.
+    fov: vertical, radians. aspect: width over height.
     """
     half = math.atan(math.tan(fov / 2) * min(1.0, aspect))
     distance = _MARGIN * frame.reach / math.sin(half)
@@ -47,26 +47,27 @@ def place(frame: OrbitFrame, away: Tensor, fov: float, aspect: float) -> Tensor:
 
 
 def look(client: ClientHandle, frame: OrbitFrame, away: Tensor | None = None) -> None:
-    """Turn a page's camera to the frame; away: from which side, its own if None."""
+    """Turn a page's camera to the frame; away: direction [3] of the new position, the present one if None."""
     camera = client.camera
     if away is None:
-        away = torch.from_numpy(camera.position / _WORLD).double() - frame.center
+        away = torch.from_numpy(camera.position / WORLD).double() - frame.center
     with client.atomic():
         camera.up_direction = frame.up.numpy()
-        camera.position = _WORLD * place(frame, away, camera.fov, camera.aspect).numpy()
-        camera.look_at = _WORLD * frame.center.numpy()
+        camera.position = WORLD * place(frame, away, camera.fov, camera.aspect).numpy()
+        camera.look_at = WORLD * frame.center.numpy()
 
 
 def look_as(client: ClientHandle, cameras: Sequence[Camera]) -> None:
     """Turn a page's camera to what the training cameras look at, from where the first of them stands."""
     centers = torch.stack([camera.center.double() for camera in cameras])
     forwards = torch.stack([camera.rotation[2].double() for camera in cameras])
-    aside = torch.eye(3, dtype=torch.float64) - forwards[:, :, None] * forwards[:, None, :]  # square to what each looks
+    # Projections [V, 3, 3] onto the planes at right angles to the views.
+    aside = torch.eye(3, dtype=torch.float64) - forwards[:, :, None] * forwards[:, None, :]
     middle = torch.linalg.lstsq(aside.reshape(-1, 3), (aside @ centers[:, :, None]).reshape(-1, 1)).solution[:, 0]
     distance = float((middle - centers[0]) @ forwards[0])
-    if not distance > 0 or not bool(middle.isfinite().all()):  # they look apart, as in a room from its middle
+    if not distance > 0 or not bool(middle.isfinite().all()):  # The views diverge, as from the middle of a room.
         distance = 1.0
     with client.atomic():
         client.camera.up_direction = -cameras[0].rotation[1].double().numpy()
-        client.camera.position = _WORLD * centers[0].numpy()
-        client.camera.look_at = _WORLD * (centers[0] + distance * forwards[0]).numpy()
+        client.camera.position = WORLD * centers[0].numpy()
+        client.camera.look_at = WORLD * (centers[0] + distance * forwards[0]).numpy()

@@ -14,11 +14,11 @@ from beags_plugin.core.surfels import Surfels, opacities
 
 @dataclass(frozen=True)
 class Choice:
-    """The parts of a scene to look at; every method returns another choice and leaves the scene alone.
+    """The parts of a scene to look at; every method returns a new choice and leaves the scene alone.
 
-    hidden: class ids that belong to the rest. removed: class ids that are gone, whatever ``faded_opacity`` is.
-    isolated: the one class that does not belong to the rest; None: all but the hidden. faded_opacity: 0..1, factor of
-    the rest's opacity; 0 leaves it out. min_opacity: 0..1, weaker Gaussians are left out.
+    hidden: class ids that belong to the rest. removed: class ids that are left out, whatever ``faded_opacity`` is.
+    isolated: the one class outside the rest; None: all but the hidden ones. faded_opacity: 0..1, factor of the rest's
+    opacity; 0 leaves the rest out. min_opacity: 0..1, weaker Gaussians are left out.
     """
 
     hidden: frozenset[int] = frozenset()
@@ -42,7 +42,7 @@ class Choice:
         return replace(self.show(class_id), removed=self.removed | {class_id}, isolated=isolated)
 
     def show(self, class_id: int) -> Choice:
-        """Show this class again; also the others, if another one was isolated."""
+        """Show this class again; if another one was isolated, show the others too."""
         isolated = class_id if self.isolated == class_id else None
         return replace(self, hidden=self.hidden - {class_id}, removed=self.removed - {class_id}, isolated=isolated)
 
@@ -93,7 +93,7 @@ class Visible:
 
 
 @torch.no_grad()
-def shown(
+def visible_part(
     surfels: Surfels, members: Membership, choice: Choice, rest: bool = True, inside: Tensor | None = None
 ) -> Visible:
     """Return the part of a scene that ``choice`` leaves.
@@ -112,16 +112,16 @@ def shown(
     if choice.isolated is not None:
         fades |= ~members.of(choice.isolated)
     keep &= ~_of_any(members, choice.removed)
-    left = choice.faded_opacity if rest else 0.0
-    if left <= 0.0:
+    opacity = choice.faded_opacity if rest else 0.0
+    if opacity <= 0.0:
         keep &= ~fades
     index = keep.nonzero()[:, 0]
     chosen = surfels[index]
-    if 0.0 < left < 1.0:
-        faded = torch.logit(left * opacities(chosen.opacity_logits), eps=1e-6)  # below 1 / 255 is as good as 0
+    if 0.0 < opacity < 1.0:
+        faded = torch.logit(opacity * opacities(chosen.opacity_logits), eps=1e-6)  # Less than 1 / 255 is invisible.
         chosen = replace(chosen, opacity_logits=torch.where(fades[index], faded, chosen.opacity_logits))
     class_ids = members.class_ids[index]
-    if choice.isolated is not None and members.objects is not None:  # shared ones may be shown in another class
+    if choice.isolated is not None and members.objects is not None:  # Shared Gaussians may have another class.
         class_ids = torch.where(members.of(choice.isolated)[index], choice.isolated, class_ids)
     return Visible(chosen, class_ids, index)
 
@@ -130,7 +130,7 @@ def _of_any(members: Membership, classes: frozenset[int]) -> Tensor:
     """Return [N] bool, the Gaussians of any of the classes."""
     if members.objects is None:
         return torch.isin(members.class_ids, members.class_ids.new_tensor(sorted(classes)))
-    found = torch.zeros_like(members.class_ids, dtype=torch.bool)
+    inside = torch.zeros_like(members.class_ids, dtype=torch.bool)
     for class_id in classes:
-        found |= members.of(class_id)
-    return found
+        inside |= members.of(class_id)
+    return inside

@@ -8,7 +8,6 @@ import sys
 import threading
 import time
 import webbrowser
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,23 +18,23 @@ from beags_plugin.system.progress import say
 if TYPE_CHECKING:
     from viser import ViserServer
 
-_PATIENCE = 5.0  # seconds without a page after which it was closed, not loaded again
-_LAST_WORDS = 1.5  # seconds in which pages show that the masks are saved
+_PATIENCE = 5.0  # Seconds without a page after which it counts as closed, not as reloaded.
+_LAST_WORDS = 1.5  # Seconds for pages to show that the masks are saved.
 
 
 @dataclass(frozen=True)
 class Errand:
-    """What is to be picked. folder: for the masks. names: of the objects that are expected, to begin with."""
+    """Objects to pick. folder: for their masks. names: first names of the expected objects."""
 
     folder: Path
     names: tuple[str, ...]
 
     def picks(self) -> Picks:
-        """Return the expected objects, of which nothing is picked."""
+        """Return the expected objects with nothing picked."""
         return Picks(tuple(Picked(name) for name in self.names))
 
     def help(self) -> str:
-        """Return what the tab says first."""
+        """Return the tab's first text."""
         if len(self.names) == 1:
             return "Click on the object; the mouse still turns the camera. Then press Save as masks."
         return (
@@ -44,24 +43,25 @@ class Errand:
         )
 
     def doubt(self, picks: Picks) -> str | None:
-        """Return a sentence on what is missing of the objects that are expected; None where nothing is."""
+        """Return a sentence on expected objects that are not picked or named; None if none is missing."""
         missing = [one.name for one in picks.objects if not one.changed]
         picked = len(picks.objects) - len(missing)
         if picked and missing:
             return (
-                f"{picked} of {len(picks.objects)} objects are picked, {_listed(missing)} not: press Another object "
+                f"{picked} of {len(picks.objects)} objects are picked, {', '.join(missing)} not: press Another object "
                 "and click on it, or press Save as masks again to go on without."
             )
         unnamed = [one.name for one in picks.changed() if one.name in self.names]
         if unnamed and len(self.names) > 1:
+            verb, own = ("has", "its own") if len(unnamed) == 1 else ("have", "their own")
             return (
-                f"{_listed(unnamed)} {'has' if len(unnamed) == 1 else 'have'} no name of {_own(unnamed)} yet: choose "
-                "it under Picked and write into Name, or press Save as masks again to go on."
+                f"{', '.join(unnamed)} {verb} no name of {own} yet: choose it under Picked and write into Name, or "
+                "press Save as masks again to go on."
             )
         return None
 
     def serve(self, server: ViserServer) -> None:
-        """Open a page, or say how to; say so when all pages are closed."""
+        """Open a page, or print how to open one; print a reminder when all pages are closed."""
         address = f"http://{server.get_host()}:{server.get_port()}"
         say(f"Pick in the browser: {address} (click on the object, then press Save as masks).")
         if _has_window():
@@ -87,18 +87,10 @@ class Errand:
         time.sleep(_LAST_WORDS)
         server.stop()
         sys.stdout.flush()
-        os._exit(0)  # a render thread inside the rasterizer would abort an interpreter that ends
-
-
-def _own(names: Sequence[str]) -> str:
-    return "its own" if len(names) == 1 else "their own"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names)
+        os._exit(0)  # A normal exit would abort in a render thread inside the rasterizer.
 
 
 def _has_window() -> bool:
-    """Return whether a browser can show a window to whoever sits at the terminal."""
-    shown = ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY")
-    return sys.platform in ("darwin", "win32") or any(os.environ.get(each) for each in shown)
+    """Return whether a browser can show a window to the user of the terminal."""
+    variables = ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY")
+    return sys.platform in ("darwin", "win32") or any(os.environ.get(each) for each in variables)

@@ -1,4 +1,4 @@
-"""Files of what a viewer shows, written beside it."""
+"""Write what a viewer shows into files, in a thread of its own."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ from beags_plugin.system.errors import UserError
 class ShownFiles:
     """Writer of the part that ``viewing`` shows, in a thread of its own, one file at a time.
 
-    title, format_name: return the file's name and its format. report: receives sentences on the progress. part: returns
-    the Gaussians of the file; what is shown in full, if None. scale_by: returns what gives it a size: see
-    ``PoseOptions``.
+    title, format_name: return the file's name and its format. report: receives messages. part: returns the Gaussians of
+    the file; if None, all that are shown in full. scale_by: returns the size: see ``PoseOptions``.
     """
 
     def __init__(
@@ -39,7 +38,7 @@ class ShownFiles:
         self._busy = threading.Lock()
 
     def start(self) -> None:
-        """Begin to write; ``report`` receives the rest."""
+        """Begin to write; messages go to ``report``."""
         if not self._busy.acquire(blocking=False):
             self._report("The former export is still being written.")
             return
@@ -52,7 +51,7 @@ class ShownFiles:
             message = f"Exported to {self.write(scale_by)}{', to scale.' if scale_by else ''}"
         except UserError as error:
             message = f"Not exported: {error}"
-        except Exception as error:  # nobody else sees an exception of a thread
+        except Exception as error:  # Nothing else reports an exception of a thread.
             message = f"Not exported ({type(error).__name__}: {error})."
         finally:
             self._busy.release()
@@ -75,4 +74,4 @@ class ShownFiles:
 
     def report_views(self, done: int, total: int) -> None:
         """Report the number of rendered views of a mesh."""
-        self._report(f"Exporting: {done} of {total} views are drawn.")
+        self._report(f"Exporting: {done} of {total} views are rendered.")

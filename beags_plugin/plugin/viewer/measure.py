@@ -1,4 +1,4 @@
-"""A known length in a scene, by two clicks: what exported files get their size from."""
+"""A known length in a scene, given by two clicks; it sets the size of exported files."""
 
 from __future__ import annotations
 
@@ -10,19 +10,22 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.export.pose_options import check_length, scale_by_text
-from beags_plugin.plugin.viewer.picking import BUSY, PATIENCE, camera_along
+from beags_plugin.plugin.viewer.picking import camera_along
 from beags_plugin.plugin.viewer.pointing import along
 from beags_plugin.plugin.viewer.viewing import Viewing
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
 from beags_plugin.surfaces.frames import Frame
 from beags_plugin.system.errors import UserError
 
-_APART = 4.0  # pixels of the page: nearer points are the same one, clicked twice
+_APART = 4.0  # Pixels of the page; nearer points are the same one, clicked twice.
 
 
 @dataclass(frozen=True)
 class Place:
-    """A place under a click: [3] float64, nerfstudio's world, and how large a pixel of the page is there."""
+    """A place under a click.
+
+    point: [3] float64, nerfstudio's world. pixel: size of the page's pixels there, world units.
+    """
 
     point: Tensor
     pixel: float
@@ -30,22 +33,18 @@ class Place:
 
 @torch.no_grad()
 def place_under(viewing: Viewing, position: Sequence[float], page: Camera) -> Place:
-    """Return what a click shows, at the depth at which half of the light is stopped, as ``--scale-by`` takes a photo's.
+    """Return the place under a click, at the median depth, as ``--scale-by`` does for pixels of a photo.
 
-    position, page: see ``click_mark``. Raises ``UserError`` where nothing solid is shown.
+    position, page: see ``click_mark``. Raises ``UserError`` if nothing solid is there.
     """
     direction, model = along(position, page), viewing.model
     view = camera_along(page.center.tolist(), direction.tolist(), focal=float(page.K[1, 1]))
-    if not viewing.lock.acquire(timeout=PATIENCE):
-        raise UserError(BUSY)
-    try:
-        surfels = viewing.shown().surfels
+    with viewing.held_soon():
+        surfels = viewing.visible().surfels
         render = model.rasterizer.rasterize(
             geometry_inputs(surfels), view.to(surfels.means.device), model.settings(), surfels.means.new_zeros(3)
         )
         depth = float(surface_depth(render, "median")[0, 0])
-    finally:
-        viewing.lock.release()
     if not depth > 0:
         raise UserError("nothing solid is shown there: click on the scene.")
     return Place(page.center.double() + depth * direction / direction.norm(), depth / float(page.K[1, 1]))
@@ -53,13 +52,13 @@ def place_under(viewing: Viewing, position: Sequence[float], page: Camera) -> Pl
 
 @dataclass(frozen=True)
 class Measure:
-    """At most two places, and the text of the length between them; every method leaves the measure alone."""
+    """At most two places, and the text of the length between them; no method changes the measure itself."""
 
     places: tuple[Place, ...] = ()
     length: str = ""
 
     def clicked(self, place: Place) -> Measure:
-        """Add a place; the third one begins anew. Raises ``UserError`` if it is the one that is there."""
+        """Add a place; a third one begins anew. Raises ``UserError`` for the same place twice."""
         if len(self.places) != 1:
             return replace(self, places=(place,))
         (first,) = self.places
@@ -68,9 +67,9 @@ class Measure:
         return replace(self, places=(first, place))
 
     def scale_by(self, world: Frame) -> str:
-        """Return the text of ``--scale-by``; empty where nothing is measured.
+        """Return the text of ``--scale-by``; empty if nothing is measured.
 
-        world: the input's. Raises ``UserError`` for a measure that lacks something.
+        world: frame of the input poses. Raises ``UserError`` for an incomplete measure.
         """
         typed = bool(self.length.strip())
         if not self.places and not typed:

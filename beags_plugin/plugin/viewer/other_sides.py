@@ -1,4 +1,4 @@
-"""Small pictures of what has been picked, from sides from which nobody has clicked on it."""
+"""Small pictures of the picked object from sides that were not clicked."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from beags_plugin.plugin.viewer.choice import Visible
 from beags_plugin.plugin.viewer.viewing import Paint, Viewing, plain_outputs
 
 SIDES = 4
-_PIXELS = 150  # Each side of a picture has as many.
-_MARGIN = 1.6  # around the object, for what the cut has missed
-_GAP = 4  # pixels between two pictures
-_TRIED = 10  # views, of which some see the object behind other things
-_WHITE, _LEAST_SHOWN = 0.9, 0.03  # light of the object painted white, and the share of the picture that it must have
+_PIXELS = 150  # Pixels on each side of a picture.
+_MARGIN = 1.6  # Size of a picture in units of the object, so that it shows what the cut has missed.
+_GAP = 4  # Pixels between two pictures.
+_TRIED = 10  # Views to try, as some see the object behind other things.
+_WHITE, _LEAST_SHARE = 0.9, 0.03  # Least brightness of the object painted white, and least share of the picture.
 
 
 def other_sides(cameras: Sequence[Camera], center: Tensor, clicked: Sequence[Tensor], count: int = SIDES) -> list[int]:
-    """Return which cameras see a place from sides far from ``clicked`` and from one another, at most ``count``.
+    """Return at most ``count`` cameras that see a place from sides far from ``clicked`` and from one another.
 
-    center: [3], of the object. clicked: centres [3] of the cameras of all clicks.
+    center: [3], of the object. clicked: camera centres [3] of all clicks.
     """
     center = center.double()
     seeing = [index for index, camera in enumerate(cameras) if _sees(camera, center)]
     towards = {index: _direction(cameras[index].center, center) for index in seeing}
     near = [_direction(each, center) for each in clicked]
-    found: list[int] = []
-    while len(found) < count and (left := [index for index in seeing if index not in found]):
-        best = min(left, key=lambda index: max((float(towards[index] @ each) for each in near), default=0.0))
-        found.append(best)
+    chosen: list[int] = []
+    while len(chosen) < count and (others := [index for index in seeing if index not in chosen]):
+        best = min(others, key=lambda index: max((float(towards[index] @ each) for each in near), default=0.0))
+        chosen.append(best)
         near.append(towards[best])
-    return found
+    return chosen
 
 
 def _direction(place: Tensor, center: Tensor) -> Tensor:
@@ -51,8 +51,8 @@ def _sees(camera: Camera, center: Tensor) -> bool:
     return float(local[2]) > 0 and 0 <= column < camera.width and 0 <= row < camera.height
 
 
-def close_camera(camera: Camera, points: Tensor, pixels: int = _PIXELS) -> Camera | None:
-    """Return a camera of the same place whose square picture shows ``points`` [P, 3]; None where it sees none."""
+def close_camera(camera: Camera, points: Tensor) -> Camera | None:
+    """Return a camera at the same place whose square picture shows ``points`` [P, 3]; None if it sees none."""
     local = points.double().cpu() @ camera.rotation.double().cpu().T + camera.translation.double().cpu()
     local = local[local[:, 2] > 0]
     if len(local) == 0:
@@ -60,20 +60,20 @@ def close_camera(camera: Camera, points: Tensor, pixels: int = _PIXELS) -> Camer
     plane = local[:, :2] / local[:, 2:]
     low, high = plane.quantile(0.01, dim=0), plane.quantile(0.99, dim=0)
     half = max(_MARGIN * float((high - low).max()) / 2, 4.0 / float(camera.K[0, 0]))
-    focal, middle = pixels / (2 * half), (low + high) / 2
+    focal, middle = _PIXELS / (2 * half), (low + high) / 2
     K = torch.tensor(
         [
-            [focal, 0.0, pixels / 2 - focal * float(middle[0])],
-            [0.0, focal, pixels / 2 - focal * float(middle[1])],
+            [focal, 0.0, _PIXELS / 2 - focal * float(middle[0])],
+            [0.0, focal, _PIXELS / 2 - focal * float(middle[1])],
             [0.0, 0.0, 1.0],
         ]
     )
-    return Camera(camera.viewmat.cpu(), K, pixels, pixels)
+    return Camera(camera.viewmat.cpu(), K, _PIXELS, _PIXELS)
 
 
 @torch.no_grad()
 def sides_picture(viewing: Viewing, members: Tensor, clicked: Sequence[Tensor], paint: Paint) -> str | None:
-    """Return Markdown of a picture of the chosen object from ``SIDES`` other sides; None where no camera sees it.
+    """Return Markdown of a picture of the chosen object from ``SIDES`` other sides; None if no camera sees it.
 
     members: [N] bool. clicked: see ``other_sides``. paint: of the picks.
     """
@@ -82,21 +82,21 @@ def sides_picture(viewing: Viewing, members: Tensor, clicked: Sequence[Tensor], 
     points = surfels.means[members.to(surfels.means.device)].cpu()
     if run is None or len(points) == 0:
         return None
-    if len(points) > 20_000:  # quantile takes no more than 16 million values
+    if len(points) > 20_000:  # torch.quantile accepts 16 million values at most.
         points = points[:: math.ceil(len(points) / 20_000)]
     scene = Visible(surfels, model.class_ids, None)
     alone = Paint(torch.ones_like(paint.colors), members.float().to(model.device))
-    shown: dict[str, np.ndarray] = {}
+    pictures: dict[str, np.ndarray] = {}
     for index in other_sides(run.cameras, points.double().median(dim=0).values, clicked, _TRIED):
         camera = close_camera(run.cameras[index], points)
-        if camera is None or len(shown) == SIDES:
+        if camera is None or len(pictures) == SIDES:
             continue
         camera = camera.to(model.device)
         black = model.background_color.new_zeros(3)
         bright, painted = (plain_outputs(model, scene, camera, black, each)["rgb"] for each in (alone, paint))
-        if float((bright.amin(dim=2) > _WHITE).float().mean()) > _LEAST_SHOWN:
-            shown[run.names[index]] = (255 * painted).round().to(torch.uint8).cpu().numpy()
-    return picture_text(_grid(list(shown.values())), ", ".join(shown)) if shown else None
+        if float((bright.amin(dim=2) > _WHITE).float().mean()) > _LEAST_SHARE:
+            pictures[run.names[index]] = (255 * painted).round().to(torch.uint8).cpu().numpy()
+    return picture_text(_grid(list(pictures.values())), ", ".join(pictures)) if pictures else None
 
 
 def _grid(pictures: Sequence[np.ndarray]) -> np.ndarray:
@@ -110,7 +110,7 @@ def _grid(pictures: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def picture_text(picture: np.ndarray, title: str) -> str:
-    """Return a picture [H, W, 3] uint8 as Markdown that is as wide as the panel. title: shows under the mouse."""
+    """Return a picture [H, W, 3] uint8 as Markdown that is as wide as the panel. title: appears under the mouse."""
     _, content = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
     url = f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode()}"
     words = "".join(letter if letter.isalnum() or letter in " .,_-" else "?" for letter in title)

@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from statistics import median
 
-SECONDS = 0.055  # for rendering one picture; with what nerfstudio does to send it, more than 15 come in a second
-_HEIGHT = 256  # of the first pictures; each level has twice the pixels of the one below
-_GUESS = 1.3  # times the work of a level, for the one above, as long as it is not known
-_WORTH = 0.7  # at most this much of a level's work makes the one below worth its coarser pictures
-_LEAST, _KEPT = 5, 8  # pictures of a level: before the next choice, and remembered
+SECONDS = 0.055  # Time to render one picture; with nerfstudio's time to send it, more than 15 arrive in a second.
+_HEIGHT = 256  # Height of the first pictures; each level has twice the pixels of the one below.
+_GUESS = 1.3  # Guessed work of the level above, in units of the present level's, until it is measured.
+_WORTH = 0.7  # The level below is chosen only if it has at most this share of the present level's work.
+_LEAST, _KEPT = 5, 8  # Pictures of a level before the next choice, and pictures remembered.
 
 
 class Pace:
     """Chooses the largest size that can be rendered in ``SECONDS``.
 
-    Nerfstudio's own choice takes the seconds for proportional to the pixels. A scene of many Gaussians takes most of
-    them for projecting and sorting, whatever the size: pictures then get smaller and smaller and no quicker. Here they
-    get smaller only if that pays, judged by the processor's time, which other programs disturb little.
+    Nerfstudio assumes that time is proportional to pixels. With many Gaussians, projecting and sorting take most of the
+    time at any size, so its pictures get smaller and smaller but no quicker. Here they get smaller only if that saves
+    enough processor time, which other programs disturb little.
     """
 
     def __init__(self) -> None:
@@ -28,7 +28,7 @@ class Pace:
         self._seconds: dict[int, deque[float]] = defaultdict(lambda: deque(maxlen=_KEPT))
 
     def took(self, pixels: int, gaussians: int, seconds: float, work: float) -> None:
-        """Take the time of a picture, if it is of the size that was chosen. work: of the processor, all cores."""
+        """Record the time of a picture if it has the chosen size. work: processor time of all cores, seconds."""
         if gaussians != self._gaussians:
             self._gaussians = gaussians
             self._work.clear()
@@ -39,7 +39,7 @@ class Pace:
                 self._level = self._next(self._level)
 
     def _next(self, level: int) -> int:
-        work = {of: min(kept) for of, kept in self._work.items()}
+        work = {each: min(times) for each, times in self._work.items()}
         here, below, above = work[level], work.get(level - 1, 0.0), work.get(level + 1)
         seconds = median(self._seconds[level])
         if above is not None and here > _WORTH * above:
@@ -49,10 +49,10 @@ class Pace:
         return level + 1 if seconds * (_GUESS if above is None else above / max(here, 1e-9)) < SECONDS else level
 
     def size(self, aspect: float, longest: int) -> tuple[int, int]:
-        """Return (height, width) of the next picture. aspect: width over height. longest: the most of either side."""
+        """Return (height, width) of the next picture. aspect: width over height. longest: most pixels of a side."""
         most = min(longest, int(longest / aspect))
         while self._level > 0 and _HEIGHT * 2 ** (self._level / 2 - 0.5) >= most:
-            self._level -= 1  # the one below is as large as may be
+            self._level -= 1  # The level below already fills the largest size.
         height = max(min(int(_HEIGHT * 2 ** (self._level / 2)), most), 30)
         width = max(1, int(height * aspect))
         self._pixels = height * width

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,26 +23,23 @@ from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.plugin.viewer.aim import frame_of, look, look_as, side_of_photos
 from beags_plugin.plugin.viewer.clicks import SceneClicks
 from beags_plugin.plugin.viewer.export import ShownFiles
-from beags_plugin.plugin.viewer.legend import LegendRow, capitalised, escaped, legend
-from beags_plugin.plugin.viewer.listed import Listed
+from beags_plugin.plugin.viewer.legend import LegendRow, Listed, capitalised, escaped, legend, show_to_paste
 from beags_plugin.plugin.viewer.pick_tab import PickTab
 from beags_plugin.plugin.viewer.pick_work import take_picked
 from beags_plugin.plugin.viewer.picking import under_cursor
 from beags_plugin.plugin.viewer.serving import (
-    crop_box_of,
     end_when_interrupted,
     first_folder,
     hide_training_cameras,
     offer_whole_pictures,
-    outputs_of,
     repeat,
     set_pace,
+    show_text,
 )
 from beags_plugin.plugin.viewer.size_tab import SizeTab
-from beags_plugin.plugin.viewer.to_paste import show_to_paste
 from beags_plugin.plugin.viewer.viewed_run import ViewedRun
 from beags_plugin.plugin.viewer.viewing import NO_CLASSES, Viewing
-from beags_plugin.plugin.viewer.window import Windows, shown_finished
+from beags_plugin.plugin.viewer.window import Windows, set_up_finished
 from beags_plugin.system.errors import UserError
 
 if TYPE_CHECKING:
@@ -51,15 +47,15 @@ if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
     from viser import ClientHandle, ViserServer
 
-NONE = "none yet"  # the drop-down's entry while no Gaussian has a class: it must have one
-REFRESH_SECONDS = 0.3  # how often the panel follows what the scene and the render threads have changed
+NONE = "none yet"  # Entry of the drop-down, which must have one, as long as no Gaussian has a class.
+REFRESH_SECONDS = 0.3  # Time between two updates of the panel from scene and render threads.
 
 
 class ObjectPanel(ViewerElement[None]):
-    """All controls of ours as one element, so that they stand in this order and not in that of their names.
+    """All our controls as one element, because nerfstudio sorts elements by name.
 
-    They change ``plugin.viewer.choice``, never the scene. Slow work happens in threads of the panel's own: no control
-    waits for a training step but those that pick and centre, and none runs in a render thread.
+    They change ``plugin.viewer.choice``, never the scene. Slow work runs in the panel's own threads: only the controls
+    that pick and centre wait for a training step, and none runs in a render thread.
     """
 
     def __init__(self, viewing: Viewing) -> None:
@@ -79,13 +75,13 @@ class ObjectPanel(ViewerElement[None]):
         self._legend: Any = None
         self._status: Any = None
         self.object = ViewerDropdown("Object", NONE, [NONE], hint="Also chosen by picking")
-        # two rows: four buttons in one are cut off
+        # There are two rows, because four buttons in one are cut off.
         self.look = ViewerButtonGroup("Look at it", "Isolate", ["Isolate", "Show"], cb_hook=self._act)
         self.put_away = ViewerButtonGroup("Put it away", "Hide", ["Hide", "Remove"], cb_hook=self._act)
         self.show_all = ViewerButton("Show all objects", lambda _: self.choose(self.viewing.choice.show_all()))
         self.rest = ViewerSlider(
             "Rest", 0.0, 0.0, 1.0, 0.05, cb_hook=lambda slider: self._slide(faded_opacity=slider.value),
-            hint="Opacity left to what is hidden, or not isolated; removed objects stay away",
+            hint="Opacity of what is hidden, or not isolated; removed objects stay invisible",
         )  # fmt: skip
         self.min_opacity = ViewerSlider(
             "Least opacity", 0.0, 0.0, 1.0, 0.01, cb_hook=lambda slider: self._slide(min_opacity=slider.value),
@@ -116,28 +112,27 @@ class ObjectPanel(ViewerElement[None]):
             self.format.install(viser_server)
             self.export.install(viser_server)
             self._status = gui.add_markdown("")
-        self._texts = ["", ""]
         self.look.value = self.put_away.value = ""
 
     def _create_gui_handle(self, viser_server: ViserServer) -> None:
         raise NotImplementedError("this element has no handle of its own")
 
     def attach(self, viewer: Viewer, link: ViewerControl) -> None:
-        """Begin work with a viewer that has installed the panel."""
+        """Connect to a viewer that has installed the panel."""
         self.viewer, self._link = viewer, link
         run = ViewedRun(Path(viewer.log_filename).parent.absolute(), viewer.pipeline.datamanager)  # type: ignore[arg-type]
         if viewer.trainer is None and (damaged := take_picked(self.viewing.model, run.folder)):
             self.note("picked", damaged)
         self.viewing.attach(run, viewer.trainer is not None, viewer.train_lock)
-        self.viewing.wanted, self.viewing.crop_box = self._wanted, self._crop_box
+        self.viewing.requested, self.viewing.crop_box = self._requested, self._crop_box
         if self._server is not None:
             self.clicks = clicks = SceneClicks(self._server)
-            if viewer.trainer is None:  # Gaussians that are trained have no fixed numbers
+            if viewer.trainer is None:  # Training renumbers the Gaussians.
                 self.pick_tab = PickTab(self._server, self.viewing, self._listed, self._redraw, clicks, self._scale_by)
             self.size_tab = SizeTab(self._server, self.viewing, clicks)
             hide_training_cameras(viewer, lambda index: self._hit_camera(run.names[index]))
             if viewer.trainer is None:
-                self._windows = shown_finished(viewer)
+                self._windows = set_up_finished(viewer)
         if run.note is not None:
             self.note("run", run.note)
         offer_whole_pictures(viewer.control_panel)
@@ -148,45 +143,42 @@ class ObjectPanel(ViewerElement[None]):
             end_when_interrupted(viewer.viser_server)
         threading.Thread(target=self._follow, name="beags panel", daemon=True).start()
 
-    def listen(self, wanted: bool) -> None:
-        """Begin or end to wait for the click that picks.
-
-        The page holds its camera still while a click is waited for, so one click only is.
-        """
-        if self._link is None or wanted == self._listening:
+    def listen(self, listening: bool) -> None:
+        """Start or stop waiting for the click that picks; only one, because the page's camera is fixed meanwhile."""
+        if self._link is None or listening == self._listening:
             return
-        self._listening = wanted
-        if wanted:
+        self._listening = listening
+        if listening:
             self._link.register_pointer_cb("click", self.clicked)
         else:
             self._link.unregister_pointer_cb()
-        self.note("object", "Click an object in the picture; press again to leave it." if wanted else "")
+        self.note("object", "Click an object in the picture; press again to cancel." if listening else "")
 
     def _joined(self, client: ClientHandle) -> None:
-        """Pace a new page's pictures, and let it begin at the objects."""
+        """Set up a new page: the pace of its pictures, and a first camera at the objects."""
         assert self.viewer is not None
         set_pace(self.viewer, client.client_id, self.viewing.pace, self._windows)
         show_to_paste(client.gui)
-        # not here: no message of the page is read while this runs
+        # It runs in a thread, because no message of the page is read while this function runs.
         threading.Thread(target=self.centre, args=(client, True), daemon=True).start()
 
     def centre(self, client: ClientHandle | None, first: bool = False) -> None:
         """Turn a page's camera to the chosen object; first: to all objects, from the side of the photos."""
         run, chosen = self.viewing.run, self.labels.get(self.object.value)
-        wanted = [class_id for class_id in self.labels.values() if (class_id if first else class_id == chosen)]
-        if not wanted and not first:
+        class_ids = [class_id for class_id in self.labels.values() if (class_id if first else class_id == chosen)]
+        if not class_ids and not first:
             self.note("object", f"Nothing to centre on: {NO_CLASSES}")
         if client is None or run is None:
             return
-        if not wanted:
-            if first and self.pick_tab is not None:  # objects are still to be picked
+        if not class_ids:
+            if first and self.pick_tab is not None:  # There are no objects yet.
                 look_as(client, run.cameras)
             return
-        frame = frame_of(*self.viewing.whole(), wanted, run.cameras)
+        frame = frame_of(*self.viewing.whole(), class_ids, run.cameras)
         look(client, frame, side_of_photos(frame, run.cameras) if first else None)
 
     def _hit_camera(self, name: str) -> None:
-        """Say that a click went to a training camera, to which nerfstudio takes the page."""
+        """Report that a click hit a training camera, to which nerfstudio then moves the page."""
         text = f"The click hit the training camera of {name}, not the scene. Hide Train Cams, and click again."
         self.note("object", text)
         if self.pick_tab is not None:
@@ -194,7 +186,7 @@ class ObjectPanel(ViewerElement[None]):
 
     def _redraw(self) -> None:
         if self.viewer is not None:
-            self.viewer._trigger_rerender()  # what its own controls call; takes no lock
+            self.viewer._trigger_rerender()  # Nerfstudio's own controls call this; it takes no lock.
 
     # -- what is shown -----------------------------------------------------------------------------------------------
 
@@ -206,7 +198,7 @@ class ObjectPanel(ViewerElement[None]):
     def _act(self, group: ViewerParameter) -> None:
         if action := group.value:
             self.act(action)
-            group.value = ""  # viser reports a button only if it is not the one of its group that was pressed last
+            group.value = ""  # Else viser would not report the same button of a group twice in a row.
 
     def act(self, action: str) -> None:
         """Apply a button to the chosen object: "Isolate", "Show", "Hide" or "Remove"."""
@@ -220,17 +212,17 @@ class ObjectPanel(ViewerElement[None]):
         self.choose(replace(self.viewing.choice, **values))
 
     def clicked(self, click: ViewerClick) -> None:
-        """Choose the object under the cursor, and listen no longer."""
+        """Choose the object under the cursor, and stop listening."""
         self.listen(False)
         try:
-            found = under_cursor(self.viewing, click.origin, click.direction)
+            gaussian = under_cursor(self.viewing, click.origin, click.direction)
         except UserError as error:
             self.note("object", capitalised(error))
             return
-        label = next((label for label, class_id in self.labels.items() if class_id == found.class_id), None)
-        if label is not None and found.class_id != BACKGROUND:
+        label = next((label for label, class_id in self.labels.items() if class_id == gaussian.class_id), None)
+        if label is not None and gaussian.class_id != BACKGROUND:
             self.object.value = label
-        self.note("object", found.sentence(label))
+        self.note("object", gaussian.sentence(label))
 
     def _scale_by(self) -> str:
         return "" if self.size_tab is None else self.size_tab.scale_by()
@@ -245,32 +237,36 @@ class ObjectPanel(ViewerElement[None]):
         repeat(self.follow, REFRESH_SECONDS, lambda text: self.note("panel", text))
 
     def follow(self) -> None:
-        """Update the panel, read or compute the picture that the viewer lacks, and then ask for a new rendering."""
+        """Update the panel; compute what the shown pictures lack, and then render them again."""
         self.refresh_objects()
         self._write_texts()
         run = self.viewing.run
-        if run is not None and "occupancy_violation" in self._wanted():
+        if run is not None and "occupancy_violation" in self._requested():
             if self.viewing.model.grid is None:
                 run.load_grid()
             if self.viewing.refresh_shares():
                 self._redraw()
 
-    def _wanted(self) -> frozenset[str]:
-        return frozenset() if self.viewer is None else outputs_of(self.viewer.control_panel)
+    def _requested(self) -> frozenset[str]:
+        if self.viewer is None:
+            return frozenset()
+        controls = self.viewer.control_panel
+        return frozenset({controls.output_render} | ({controls.split_output_render} if controls.split else set()))
 
     def _crop_box(self) -> OrientedBox | None:
-        assert self.viewer is not None  # it is there when this is asked for
-        return crop_box_of(self.viewer.control_panel)
+        assert self.viewer is not None
+        controls = self.viewer.control_panel
+        return controls.crop_obb if controls.crop_viewport else None
 
     def refresh_objects(self) -> None:
-        """List the classes that have Gaussians, under the names that the model now has."""
+        """List the classes that have Gaussians, under their present names."""
         if not self.listed.refresh(self.viewing.model):
             return
         self.labels = self.listed.labels
         options, former = list(self.labels) or [NONE], self.object.value
         if self.object.options != options:
             self.object.set_options(options)
-            if former not in options:  # the first object, rather than the background
+            if former not in options:  # The first object is chosen rather than the background.
                 self.object.value = next((label for label in options if self.labels.get(label)), options[0])
 
     def _listed(self) -> dict[str, int]:
@@ -278,7 +274,7 @@ class ObjectPanel(ViewerElement[None]):
         return self.labels
 
     def note(self, about: str, text: str) -> None:
-        """Show a note below the controls, in place of the last one about the same."""
+        """Show a note below the controls, instead of the last one about the same."""
         self.notes = {**self.notes, about: text}
 
     def _write_texts(self) -> None:
@@ -292,8 +288,19 @@ class ObjectPanel(ViewerElement[None]):
         pick = "" if self.pick_tab is None else " Without masks, pick objects in the tab Pick."
         texts = [legend(rows) if rows else escaped(f"No objects: {NO_CLASSES}{pick}")]
         texts.append("\n\n".join(escaped(line) for line in lines.values() if line))
-        for index, (handle, text) in enumerate(zip((self._legend, self._status), texts, strict=True)):
-            if handle is not None and text != self._texts[index]:
-                with suppress(KeyError):  # the viewer is being closed
-                    handle.content = text
-                self._texts[index] = text
+        for handle, text in zip((self._legend, self._status), texts, strict=True):
+            if handle is not None:
+                show_text(handle, text)
+
+
+class ViewerLink(ViewerControl):
+    """Passes nerfstudio's viewer, once there is one, and clicks on the picture to the panel."""
+
+    viewer: Viewer | None = None
+
+    def __init__(self, panel: ObjectPanel) -> None:
+        self.panel = panel
+
+    def _setup(self, viewer: Viewer) -> None:
+        super()._setup(viewer)
+        self.panel.attach(viewer, self)

@@ -1,4 +1,4 @@
-"""The tab Pick of a viewer: objects are pointed at in the picture."""
+"""The tab Pick of a viewer: the user picks objects by clicks and boxes in the picture."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from beags_plugin.plugin.viewer.export import ShownFiles
 from beags_plugin.plugin.viewer.legend import LegendRow, legend, pasteable, unique_labels, wrapped
 from beags_plugin.plugin.viewer.pick_work import FIRST_COLOR, PickWork
 from beags_plugin.plugin.viewer.pointing import box_mark, click_mark, page_camera
-from beags_plugin.plugin.viewer.serving import another_tab, by_user
+from beags_plugin.plugin.viewer.serving import another_tab, by_user, show_text
 from beags_plugin.plugin.viewer.viewing import Viewing
 
 if TYPE_CHECKING:
     from viser import SceneNodePointerEvent, ScenePointerEvent, ViserServer
 
-_OF_RUN = "{} (of the run)"  # an object that can be corrected
+_OF_RUN = "{} (of the run)"  # Label of an object of the run, which can be corrected.
 _HELP = "Tick Click to pick, and click on an object; the mouse still turns the camera."
 
 
 class PickTab:
-    """Controls that say what the next click on the picture means, and what becomes of what has been picked.
+    """Controls for the meaning of the next click on the picture, and for the use of the picked objects.
 
-    labels: returns the run's objects that have Gaussians, label to class id. redraw: asks for new pictures. clicks: on
-    the picture. scale_by: of exported files: see ``PoseOptions``.
+    labels: returns the run's objects that have Gaussians, label to class id. redraw: requests new pictures. clicks: on
+    the picture. scale_by: returns the size of exported files: see ``PoseOptions``.
     """
 
     def __init__(
@@ -45,17 +45,16 @@ class PickTab:
         self._redraw = redraw
         self._boxing = False
         self._entries: dict[str, tuple[str, int]] = {}
-        self._text = ""
         self.work = PickWork(viewing, self.report, self.refresh, self.picture)
         gui = server.gui
         formats = EXPORTERS.names()
         errand = viewing.errand
         with another_tab(gui, "Pick", first=errand is not None):
-            self.picked = gui.add_dropdown("Picked", ["object 1"], hint="What the next click is about")
+            self.picked = gui.add_dropdown("Picked", ["object 1"], hint="The object of the next click")
             self.name = gui.add_text("Name", "object 1")
             self.new = gui.add_button("Another object")
             self.clicks = gui.add_checkbox("Click to pick", False, hint="A drag turns the camera all the same")
-            self.excludes = gui.add_checkbox("Exclude", False, hint="What is clicked or boxed does not belong to it")
+            self.excludes = gui.add_checkbox("Exclude", False, hint="Clicks and boxes mark what does not belong to it")
             self.box = gui.add_button("Drag a box", hint="Nothing outside of it belongs to the object")
             self.size = gui.add_button_group("Size", ["Grow", "Shrink"])
             self.undo = gui.add_button("Undo")
@@ -101,16 +100,16 @@ class PickTab:
         if self._boxing:
             return
         inside, position, camera = not self.excludes.value, event.screen_pos, page_camera(event.client.camera)
-        self._mark(lambda _: click_mark(position, camera, inside, self.work.drawn()))
+        self._mark(lambda _: click_mark(position, camera, inside, self.work.rendered()))
 
-    def take_box(self, wanted: bool) -> None:
-        """Begin or end to wait for a box; the page holds its camera still meanwhile."""
-        if wanted == self._boxing:
+    def take_box(self, waiting: bool) -> None:
+        """Start or stop waiting for a box; the page's camera is fixed meanwhile."""
+        if waiting == self._boxing:
             return
-        self._boxing = wanted
-        if wanted:
+        self._boxing = waiting
+        if waiting:
             self.server.scene.on_pointer_event("rect-select")(self.boxed)
-            self.report("Drag a box over the picture; press again to leave it.")
+            self.report("Drag a box over the picture; press again to cancel.")
         else:
             self.server.scene.remove_pointer_callback()
             self.report(self._help)
@@ -121,7 +120,7 @@ class PickTab:
         inside, corners, camera = not self.excludes.value, event.screen_pos, page_camera(event.client.camera)
 
         def mark(pointed: bool) -> ViewMarks:
-            return box_mark(corners, camera, inside, self.work.drawn(), inside and not pointed)
+            return box_mark(corners, camera, inside, self.work.rendered(), inside and not pointed)
 
         self._mark(mark)
 
@@ -160,7 +159,7 @@ class PickTab:
     # -- what the tab shows ------------------------------------------------------------------------------------------
 
     def report(self, text: str, command: str = "") -> None:
-        """Show a sentence below the controls, in place of the last one. command: to paste into a terminal."""
+        """Show a sentence below the controls, instead of the last one. command: to paste into a terminal."""
         self.note = text
         if command:
             self.command = command
@@ -169,8 +168,7 @@ class PickTab:
 
     def picture(self, text: str) -> None:
         """Show pictures of the chosen object, as Markdown."""
-        with suppress(KeyError):  # the viewer is being closed
-            self._sides.content = f"From sides that were not clicked:\n\n{text}" if text else ""
+        show_text(self._sides, f"From sides that were not clicked:\n\n{text}" if text else "")
 
     def _usual_folder(self) -> Path:
         assert self.viewing.run is not None
@@ -182,14 +180,13 @@ class PickTab:
         return Path(typed).expanduser() if typed else self._usual_folder()
 
     def _say_where(self) -> None:
-        with suppress(KeyError):  # the viewer is being closed
-            ends = "" if self.viewing.errand is None else ", and ends the viewer: the program that opened it goes on"
-            where = wrapped(f"Save as masks writes to {self._folder()}{ends}")
-            after = f"\n\nRefine with the saved ones:\n\n{pasteable(self.command)}" if self.command else ""
-            self._where.content = where + after
+        ends = "" if self.viewing.errand is None else ", and ends the viewer: the program that opened it goes on"
+        where = wrapped(f"Save as masks writes to {self._folder()}{ends}")
+        after = f"\n\nRefine with the saved masks:\n\n{pasteable(self.command)}" if self.command else ""
+        show_text(self._where, where + after)
 
     def refresh(self) -> None:
-        """Show what has been picked."""
+        """Show the picked objects."""
         picks = self.work.picks
         corrected = {one.class_id for one in picks.objects}
         places = unique_labels({place: one.name for place, one in enumerate(picks.objects)})
@@ -198,7 +195,7 @@ class PickTab:
             if class_id != BACKGROUND and class_id not in corrected:
                 entries[_OF_RUN.format(label)] = ("run", class_id)
         self._entries = entries
-        with suppress(KeyError):  # the viewer is being closed
+        with suppress(KeyError):  # The viewer may be closing.
             if tuple(entries) != tuple(self.picked.options):
                 self.picked.options = tuple(entries)
             self._set(self.picked, next(label for label, place in places.items() if place == picks.place))
@@ -218,8 +215,4 @@ class PickTab:
             for place, one in enumerate(self.work.picks.objects)
             if one.members is not None
         ]
-        text = "\n\n".join([*([legend(rows)] if rows else []), wrapped(self.note)])
-        if text != self._text:
-            with suppress(KeyError):
-                self._status.content = text
-            self._text = text
+        show_text(self._status, "\n\n".join([*([legend(rows)] if rows else []), wrapped(self.note)]))

@@ -1,4 +1,4 @@
-"""Picking in a viewer: what has been picked, and the slow work for it in a thread of its own."""
+"""Picking in a viewer: the picked objects, and the slow work for them in a thread of its own."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from beags_plugin.runs.picked import with_picked, write_picked
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
 
-_CHOSEN, _OTHERS = 0.65, 0.4  # of the colour, over what has been picked
-FIRST_COLOR = 3  # of ``colorize``: one that few things have
+_CHOSEN, _OTHERS = 0.65, 0.4  # Strength of the colours over the chosen object and over the other picked ones.
+FIRST_COLOR = 3  # Index in ``colorize`` of a colour that few things have.
 Step = Callable[[Picks], Picks]
 
 
 def take_picked(model: SceneModel, run: Path) -> str | None:
-    """Give a model the classes that were picked in an earlier session; return a sentence if their file is damaged."""
+    """Set a model's classes to those picked in an earlier session; return a sentence if their file is damaged."""
     trained = model.state_dict()
     try:
         picked = with_picked(trained, run)
@@ -48,11 +48,11 @@ def take_picked(model: SceneModel, run: Path) -> str | None:
 
 
 class PickWork:
-    """What has been picked of a scene that is trained no longer; each method returns at once.
+    """The objects picked in a finished scene; each method returns at once.
 
     One thread does the steps in their order, so that neither pictures nor the page wait for a cut. A step that fails
-    changes nothing. report: receives a sentence, and a command that goes on if there is one. changed: is called after
-    every step. pictured: receives Markdown of the chosen object from other sides, "" where there is none.
+    changes nothing. report: receives a sentence, and the next command if there is one. changed: is called after every
+    step. pictured: receives Markdown of the chosen object from other sides, or "".
     """
 
     def __init__(
@@ -66,16 +66,16 @@ class PickWork:
         self._changed = changed
         self._pictured = pictured
         self._history: list[Picks] = []
-        self._asked = ""  # the doubt that Save as masks has been answered with
+        self._doubt = ""  # The doubt reported at the last Save as masks.
         self._made: Cutter | None = None
-        self._shown: Tensor | None = None  # the members whose other sides are shown
+        self._pictured_members: Tensor | None = None  # Members of the object in the pictures of other sides.
         self._steps: queue.SimpleQueue[Callable[[], str]] = queue.SimpleQueue()
         threading.Thread(target=self._work, name="beags pick", daemon=True).start()
 
     # -- steps -------------------------------------------------------------------------------------------------------
 
     def cut(self, step: Callable[[Cutter, Picks], Picks]) -> None:
-        """Pick anew, by a step that cuts, and can be undone."""
+        """Change the chosen object by a step that cuts, and can be undone."""
 
         def do() -> str:
             cutter, began = self._cutter(), time.perf_counter()
@@ -86,7 +86,7 @@ class PickWork:
         self._steps.put(do)
 
     def change(self, step: Step) -> None:
-        """Choose or name an object, which undoing leaves alone."""
+        """Choose or name an object; this is never undone."""
 
         def do() -> str:
             self.picks = step(self.picks)
@@ -95,7 +95,7 @@ class PickWork:
         self._steps.put(do)
 
     def undo(self) -> None:
-        """Take the last cut back."""
+        """Undo the last cut."""
 
         def do() -> str:
             if not self._history:
@@ -117,21 +117,21 @@ class PickWork:
         self._steps.put(do)
 
     def save_masks(self, folder: Path | None = None, ended: Callable[[], None] | None = None) -> None:
-        """Draw all objects into masks of the training views; see ``picked_masks.save_masks``.
+        """Render all objects into masks of the training views; see ``picked_masks.save_masks``.
 
-        ended: called once they are saved for an errand, whose doubts stop only the first try.
+        ended: called once the masks of an errand are saved; its doubts stop only the first attempt.
         """
 
         def do() -> str:
             errand = self._viewing.errand
-            if errand is not None and (doubt := errand.doubt(self.picks) or "") not in ("", self._asked):
-                self._asked = doubt
+            if errand is not None and (doubt := errand.doubt(self.picks) or "") not in ("", self._doubt):
+                self._doubt = doubt
                 return doubt
             members, names = self._viewing.model.members(), self._viewing.model.classes
-            if self.picks.changed() or not any(members.present()):  # there may be objects of the run alone
+            if self.picks.changed() or not any(members.present()):  # Else the run's own objects are saved.
                 members, names = self.picks.applied(members, names)
-            self._report("Drawing masks of all training views ...")
-            if errand is not None:  # classes of masks that the scene may have are not asked for
+            self._report("Rendering masks of all training views ...")
+            if errand is not None:  # Classes of masks that the scene may have are left out.
                 names = {each: name for each, name in names.items() if each in (BACKGROUND, *members.present())}
             saved = save_masks(self._run() / "config.yml", members, names, folder, self._photos())
             if ended is not None:
@@ -146,7 +146,7 @@ class PickWork:
         self._steps.put(do)
 
     def keep(self) -> None:
-        """Make what has been picked objects of the run, which remembers them; nothing of it can be undone then."""
+        """Store the picked objects as objects of the run; this cannot be undone."""
 
         def do() -> str:
             viewing, model = self._viewing, self._viewing.model
@@ -162,14 +162,14 @@ class PickWork:
 
     # -- reading -----------------------------------------------------------------------------------------------------
 
-    def drawn(self) -> Tensor | None:
-        """Return which of the N Gaussians the viewer shows, [N] bool; None: all."""
-        index = self._viewing.shown().index
+    def rendered(self) -> Tensor | None:
+        """Return [N] bool, the Gaussians that the viewer renders; None: all."""
+        index = self._viewing.visible().index
         if index is None:
             return None
-        found = torch.zeros(self._viewing.model.num_points, dtype=torch.bool)
-        found[index.cpu()] = True
-        return found
+        rendered = torch.zeros(self._viewing.model.num_points, dtype=torch.bool)
+        rendered[index.cpu()] = True
+        return rendered
 
     def part(self) -> Visible:
         """Return the chosen object's Gaussians, for a file; raises ``UserError`` if it has none."""
@@ -181,11 +181,11 @@ class PickWork:
         return Visible(surfels[index], torch.ones(len(index), dtype=torch.int32, device=index.device), index)
 
     def _run(self) -> Path:
-        assert self._viewing.run is not None  # the panel that picks is made for one
+        assert self._viewing.run is not None
         return self._viewing.run.folder
 
     def _photos(self) -> Path | None:
-        """Return the folder of the scene that the viewer has read, which may have been named when it was opened."""
+        """Return the folder of the photos, which may have been given when the viewer was opened."""
         assert self._viewing.run is not None
         data = self._viewing.run.datamanager.config.data
         return None if data is None else Path(data).absolute()
@@ -195,12 +195,10 @@ class PickWork:
         if one.members is None:
             return f"{one.name}: nothing yet."
         count = int(one.members.sum())
-        more = (
-            ""
-            if former is None
-            else f", {int((one.members & ~former).sum()):,} more and "
-            + (f"{int((former & ~one.members).sum()):,} fewer than before")
-        )
+        more = ""
+        if former is not None:
+            added, lost = int((one.members & ~former).sum()), int((former & ~one.members).sum())
+            more = f", {added:,} more and {lost:,} fewer than before"
         took = "" if seconds is None else f" ({seconds:.1f} s)"
         remark = takes_much(one.members) or takes_little(one.members)
         return f"{one.name}: {count:,} Gaussians{more}{took}." + (f" This is {remark}." if remark else "")
@@ -214,7 +212,7 @@ class PickWork:
                 message = step()
             except UserError as error:
                 message = f"{capitalised(error)} Nothing has been changed."
-            except Exception as error:  # nobody else sees an exception of a thread
+            except Exception as error:  # Nothing else reports an exception of a thread.
                 message = f"Nothing has been changed ({type(error).__name__}: {error})."
             self._viewing.paint = self._paint()
             if message:
@@ -224,16 +222,16 @@ class PickWork:
                 self._picture()
 
     def _picture(self) -> None:
-        """Show the chosen object from sides that nobody has clicked on, unless they are shown already."""
+        """Show the chosen object from sides that were not clicked, unless they are shown already."""
         one, paint = self.picks.chosen, self._viewing.paint
-        if one.members is self._shown:
+        if one.members is self._pictured_members:
             return
-        self._shown, text = one.members, None
+        self._pictured_members, text = one.members, None
         if one.members is not None and paint is not None:
             clicked = [view.camera.center for view in one.marks]
             try:
                 text = sides_picture(self._viewing, one.members, clicked, replace(paint, only=None))
-            except Exception as error:  # nobody else sees an exception of a thread
+            except Exception as error:  # Nothing else reports an exception of a thread.
                 self._report(f"No pictures of other sides ({type(error).__name__}: {error}).")
         self._pictured(text or "")
 
@@ -244,13 +242,13 @@ class PickWork:
             surfels, model = viewing.whole()[0], viewing.model
 
             def progress(done: int, total: int) -> None:
-                self._report(f"Getting ready, once: {done} of {total} views are seen.")
+                self._report(f"Getting ready, once: {done} of {total} views are done.")
 
             self._made = Cutter(surfels, viewing.run.cameras, model.rasterizer, model.settings(), progress)
         return self._made
 
     def _paint(self) -> Paint | None:
-        """Return the colours of what has been picked."""
+        """Return the colours of the picked objects."""
         picks, device = self.picks, self._viewing.model.device
         if all(one.members is None for one in picks.objects):
             return None

@@ -15,9 +15,7 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system.errors import UserError
 
-PATIENCE = 5.0  # seconds that a click waits for the scene
-BUSY = "the scene is busy: click again."
-_FOCAL = 1000.0  # of the one rendered pixel: about that of a full-screen view, so that it is as sharp
+_FOCAL = 1000.0  # Focal length of the one rendered pixel: about that of a full-screen view, so that it is as sharp.
 
 
 def camera_along(origin: Sequence[float], direction: Sequence[float], pixels: int = 1, focal: float = _FOCAL) -> Camera:
@@ -28,7 +26,7 @@ def camera_along(origin: Sequence[float], direction: Sequence[float], pixels: in
     position, along = (torch.tensor([float(x) for x in point], dtype=torch.float64) for point in (origin, direction))
     forward = along / along.norm()
     aside = torch.zeros(3, dtype=torch.float64)
-    aside[int(forward.abs().argmin())] = 1.0  # the axis that is least along the view
+    aside[int(forward.abs().argmin())] = 1.0  # The axis that is most nearly at right angles to the view.
     right = torch.linalg.cross(forward, aside)
     right = right / right.norm()
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
@@ -46,7 +44,7 @@ def pick(
     origin: Sequence[float],
     direction: Sequence[float],
 ) -> int | None:
-    """Return the index of the Gaussian with the largest w_i along a ray; None where nothing is. Renders one pixel.
+    """Return the index of the Gaussian with the largest w_i along a ray; None if there is none. Renders one pixel.
 
     surfels: N Gaussians, as they are rendered. origin, direction: [3], world.
     """
@@ -57,8 +55,9 @@ def pick(
 
 @dataclass(frozen=True)
 class UnderCursor:
-    """A Gaussian under the cursor: its index in the scene, its class, None before the scene has any, and the margin by
-    which it has it.
+    """A Gaussian under the cursor.
+
+    index: in the scene. class_id: None before the scene has classes. margin: of its assignment to that class.
     """
 
     index: int
@@ -66,7 +65,7 @@ class UnderCursor:
     margin: float
 
     def sentence(self, label: str | None) -> str:
-        """Return what a panel says of it; label: of its class, None without a name."""
+        """Return the panel's text on it; label: of its class, None without a name."""
         if self.class_id is None:
             return f"Gaussian {self.index}; {NO_CLASSES}"
         if label is None:
@@ -76,17 +75,13 @@ class UnderCursor:
 
 
 def under_cursor(viewing: Viewing, origin: Sequence[float], direction: Sequence[float]) -> UnderCursor:
-    """Return what a viewer shows along a ray; raises ``UserError`` if that is nothing, or the scene is busy."""
+    """Return the Gaussian that a viewer shows along a ray; raises ``UserError`` if none is there or it is busy."""
     model = viewing.model
-    if not viewing.lock.acquire(timeout=PATIENCE):
-        raise UserError(BUSY)
-    try:
-        scene = viewing.shown()
-        found = pick(model.rasterizer, scene.surfels, model.settings(), origin, direction)
-        if found is None:
+    with viewing.held_soon():
+        scene = viewing.visible()
+        rank = pick(model.rasterizer, scene.surfels, model.settings(), origin, direction)
+        if rank is None:
             raise UserError("nothing is shown there.")
-        index = found if scene.index is None else int(scene.index[found])
-        class_id = int(scene.class_ids[found]) if bool(model.assigned) else None
+        index = rank if scene.index is None else int(scene.index[rank])
+        class_id = int(scene.class_ids[rank]) if bool(model.assigned) else None
         return UnderCursor(index, class_id, float(model.class_margin[index]))
-    finally:
-        viewing.lock.release()

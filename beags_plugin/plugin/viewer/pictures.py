@@ -33,7 +33,7 @@ def boundary_picture(
     inputs = geometry_inputs(surfels, class_ids)
     bare = replace(settings, geometry=False, distortion=False)
     boundary = rasterizer.rasterize(inputs, camera, bare, inputs.means.new_zeros(3), mask).boundary
-    assert boundary is not None  # there is a target
+    assert boundary is not None
     return boundary[..., None]
 
 
@@ -65,7 +65,7 @@ def framed(picture: Tensor, width: int, height: int) -> Tensor:
 
 
 def nearest_view(camera: Camera, views: Sequence[Camera], extent: float) -> int:
-    """Return the index of the view that looks from nearest, and most the same way.
+    """Return the index of the view with the nearest centre and direction.
 
     extent: size of the scene, world units; such a distance counts as much as a right angle between the views.
     """

@@ -14,20 +14,20 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.masks.sources.cut import MARK
 from beags_plugin.picking.cutter import ViewMarks
+from beags_plugin.plugin.viewer.aim import WORLD
 from beags_plugin.plugin.viewer.picking import camera_along
 from beags_plugin.system.errors import UserError
 
 if TYPE_CHECKING:
     from viser import CameraHandle
 
-WORLD = 10.0  # viser's units in one of nerfstudio's: VISER_NERFSTUDIO_SCALE_RATIO, whose module is slow to import
 _NAME = "the viewer"
-_DIAGONAL = 1000.0  # pixels of a page, whatever its size: marks are as large as those in photos
-_LEAST_SIDE = 0.01  # of the page: a smaller box was no box, but a click
+_DIAGONAL = 1000.0  # Pixels of a page, whatever its size, so that marks are as large as in photos.
+_LEAST_SIDE = 0.01  # Share of the page; a smaller box was meant as a click.
 
 
 def along(position: Sequence[float], page: Camera) -> Tensor:
-    """Return the direction [3] float64, world, of what a page shows at ``position``: see ``click_mark``."""
+    """Return the direction [3] float64, world, of a page's ray at ``position``: see ``click_mark``."""
     pixel = torch.tensor([position[0] * page.width, position[1] * page.height, 1.0], dtype=torch.float64)
     return page.rotation.double().T @ torch.linalg.solve(page.K.double(), pixel)
 
@@ -35,7 +35,7 @@ def along(position: Sequence[float], page: Camera) -> Tensor:
 def click_mark(position: Sequence[float], page: Camera, inside: bool, drawn: Tensor | None) -> ViewMarks:
     """Return the mark of a click on the object, or beside it.
 
-    position: (x, y) in 0..1 of the page; the ray that viser 0.2.7 sends with a click on a node is another. page: see
+    position: (x, y) in 0..1 of the page; the ray that viser 0.2.7 sends with a click on a node is wrong. page: see
     ``page_camera``. drawn: see ``ViewMarks``.
     """
     direction = along(position, page)
@@ -47,10 +47,10 @@ def click_mark(position: Sequence[float], page: Camera, inside: bool, drawn: Ten
 def box_mark(
     corners: Sequence[Sequence[float]], page: Camera, inside: bool, drawn: Tensor | None, pointing: bool
 ) -> ViewMarks:
-    """Return the mark of a box outside of which, or (``inside`` False) within which nothing belongs to the object.
+    """Return the mark of a box: nothing outside of it belongs to the object, or nothing inside if ``inside`` is False.
 
-    corners: two opposite ones, (x, y) in 0..1 of the page. pointing: whether the middle of the box is a point on the
-    object. Raises ``UserError`` for a box of next to no size.
+    corners: two opposite ones, (x, y) in 0..1 of the page. pointing: whether the middle of the box is also a click on
+    the object. Raises ``UserError`` for a box of hardly any size.
     """
     (left, right), (top, bottom) = (sorted(corner[axis] for corner in corners) for axis in (0, 1))
     if min(right - left, bottom - top) < _LEAST_SIDE:
@@ -67,7 +67,7 @@ def box_mark(
 
 
 def page_camera(camera: CameraHandle) -> Camera:
-    """Return a page's camera in nerfstudio's world as it is now, for pictures of ``_DIAGONAL`` pixels."""
+    """Return a page's present camera in nerfstudio's world, for pictures of ``_DIAGONAL`` pixels."""
     from viser.transforms import SO3
 
     height = max(1, round(_DIAGONAL / math.hypot(1.0, camera.aspect)))

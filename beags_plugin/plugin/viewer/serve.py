@@ -1,4 +1,4 @@
-"""The viewer of a run of any origin: its files are read as data, and this computer alone is served."""
+"""The viewer of a run, also of other people's: its files are read as data, and only this computer is served."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HOST = "127.0.0.1"
 def viewed_pipeline(config_path: Path, data: Path | None = None) -> tuple[BeagsTrainerConfig, Pipeline, int]:
     """Read a run as ns-viewer does, but without running code that its files name; return config, pipeline and step.
 
-    data: the photos, if not where the run was trained on them. Raises ``UserError``.
+    data: folder of the photos, if they were moved. Raises ``UserError``.
     """
     config = open_for_training(config_path, data)
     check_data(config.data_path, config_path)
@@ -43,15 +43,15 @@ def viewed_pipeline(config_path: Path, data: Path | None = None) -> tuple[BeagsT
     pipeline = config.pipeline.setup(device=torch.device(default_device()), test_mode="test")
     pipeline.eval()
     pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])
-    pipeline.datamanager.get_datapath = config.get_base_dir  # camera paths go there
+    pipeline.datamanager.get_datapath = config.get_base_dir  # Camera paths are saved there.
     return config, pipeline, checkpoint["step"]
 
 
 def serve(config_path: Path, data: Path | None = None, port: int | None = None, errand: Errand | None = None) -> None:
     """Show a run in the browser until Ctrl-C; see ``viewed_pipeline``.
 
-    port: the first free one if None. errand: what is to be picked, instead of the run's objects; once it is saved, the
-    process ends.
+    port: the first free one if None. errand: objects to pick, instead of the run's; once they are saved, the process
+    ends.
     """
     config, pipeline, step = viewed_pipeline(config_path, data)
     if errand is not None:
@@ -64,4 +64,4 @@ def serve(config_path: Path, data: Path | None = None, port: int | None = None, 
     try:
         _start_viewer(config, pipeline, step)
     except KeyboardInterrupt:
-        sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]  # the panel's, which ends the process
+        sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]  # The panel's hook ends the process.

@@ -1,4 +1,4 @@
-"""Changes to nerfstudio's viewer while it serves one of our runs; other methods' viewers stay as they are."""
+"""Change nerfstudio's viewer while it serves one of our runs; other methods' viewers stay as they are."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
@@ -14,8 +14,6 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from beags_plugin.plugin.viewer.pace import Pace
 
 if TYPE_CHECKING:
-    from nerfstudio.data.scene_box import OrientedBox
-    from nerfstudio.viewer.control_panel import ControlPanel
     from nerfstudio.viewer.viewer import Viewer
     from viser import GuiApi, GuiTabHandle, ViserServer
 
@@ -24,9 +22,9 @@ if TYPE_CHECKING:
 
 @contextmanager
 def first_folder(gui: GuiApi, label: str) -> Iterator[Any]:
-    """Put controls into a folder above all others of the tab; yield nerfstudio's for us, which stays empty.
+    """Put controls into a folder above all others of the tab; yield nerfstudio's own folder for us, which stays empty.
 
-    That one, Custom Elements > model, is the last of the tab.
+    That folder, Custom Elements > model, is the last of the tab.
     """
     inner = gui._get_container_id()
     folders: Any = gui._container_handle_from_id
@@ -54,19 +52,26 @@ def another_tab(gui: GuiApi, label: str, first: bool = False) -> GuiTabHandle:
 
 
 def by_user(listener: Callable[[], None]) -> Callable[[Any], None]:
-    """Return a listener that leaves alone what the program itself has written to a control."""
+    """Return a listener that ignores values which the program itself has written to a control."""
 
-    def heard(event: Any) -> None:
+    def called(event: Any) -> None:
         if event.client_id is not None:
             listener()
 
-    return heard
+    return called
+
+
+def show_text(handle: Any, text: str) -> None:
+    """Show a text in a Markdown element, unless it does already or the viewer is closing."""
+    with suppress(KeyError):  # The element is gone.
+        if handle.content != text:
+            handle.content = text
 
 
 def set_pace(viewer: Viewer, client_id: int, pace: Pace, windows: Windows | None) -> None:
-    """Let ``pace`` choose the size of a page's pictures while its camera moves, and ``windows`` that at rest.
+    """Let ``pace`` choose the size of a page's pictures while its camera moves, and ``windows`` the size at rest.
 
-    windows: None leaves the size at rest to nerfstudio.
+    windows: if None, nerfstudio chooses the size at rest.
     """
     machine, controls = viewer.render_statemachines[client_id], viewer.control_panel
     still = machine._calculate_image_res
@@ -80,9 +85,9 @@ def set_pace(viewer: Viewer, client_id: int, pace: Pace, windows: Windows | None
 
 
 def hide_training_cameras(viewer: Viewer, hit: Callable[[int], None]) -> None:
-    """Let the training cameras be hidden at first: they stand before the objects, and take clicks meant for these.
+    """Hide the training cameras at first: they stand before the objects, and intercept clicks.
 
-    hit: is called with the number of a training view when its camera has taken a click.
+    hit: is called with the index of a training view whose camera was clicked.
     """
     draw = viewer.init_scene
 
@@ -96,20 +101,10 @@ def hide_training_cameras(viewer: Viewer, hit: Callable[[int], None]) -> None:
     viewer.init_scene = draw_hidden  # type: ignore[method-assign]
 
 
-def outputs_of(controls: ControlPanel) -> frozenset[str]:
-    """Return the outputs that a viewer shows: one, or two on its split screen."""
-    return frozenset({controls.output_render} | ({controls.split_output_render} if controls.split else set()))
-
-
-def crop_box_of(controls: ControlPanel) -> OrientedBox | None:
-    """Return the box to which a viewer crops the scene; None where it does not."""
-    return controls.crop_obb if controls.crop_viewport else None
-
-
 def offer_whole_pictures(controls: Any) -> None:
-    """Leave nerfstudio's "gl_z_buf_depth" out of the lists of outputs.
+    """Remove nerfstudio's "gl_z_buf_depth" from the lists of outputs.
 
-    It is smaller than the picture. nerfstudio puts it into the split screen at first, and joining the two ends the
+    It is smaller than the picture, and it is the first choice for the split screen, where joining the two would end the
     render thread.
     """
     offer = controls.update_output_options
@@ -117,7 +112,7 @@ def offer_whole_pictures(controls: Any) -> None:
 
 
 def repeat(step: Callable[[], None], seconds: float, failed: Callable[[str], None]) -> None:
-    """Do a step every ``seconds``, for good: an exception does not end it. failed: receives a word about each."""
+    """Do a step every ``seconds``, for ever. failed: receives a message about each exception."""
     pause = threading.Event()
     while not pause.wait(seconds):
         try:
@@ -126,32 +121,32 @@ def repeat(step: Callable[[], None], seconds: float, failed: Callable[[str], Non
             failed(f"{type(error).__name__}: {error}")
 
 
-def end_rendering(viewer: object, seconds: float = 30.0) -> None:
-    """End the render threads of every page of a viewer, waiting at most ``seconds`` for each to finish its picture.
+def end_rendering(viewer: object) -> None:
+    """End the render threads of every page of a viewer, waiting at most 30 s for each to finish its picture.
 
     viewer: nerfstudio's, or None. A render thread inside the rasterizer would abort an interpreter that ends.
     """
     threads = [
         thread
-        for thread in threading.enumerate()  # with those whose page is closed already
+        for thread in threading.enumerate()  # Also those whose page is closed already.
         if isinstance(thread, RenderStateMachine) and thread.viewer is viewer
     ]
     for thread in threads:
         thread.running = False
     for thread in threads:
-        thread.join(seconds)
+        thread.join(30.0)
 
 
 def end_when_interrupted(server: ViserServer) -> None:
-    """Let Ctrl-C end ns-viewer without a traceback, and with exit code 0: it has no other end."""
+    """Let Ctrl-C, which is the only way to end ns-viewer, end it without a traceback and with exit code 0."""
     former = sys.excepthook
 
     def hook(kind: type[BaseException], error: BaseException, traceback: Any) -> None:
         if not issubclass(kind, KeyboardInterrupt):
             return former(kind, error, traceback)
-        server.stop()  # which prints
+        server.stop()  # It prints a message.
         sys.stderr.flush()
         print("\nThe viewer is closed.", flush=True)
-        os._exit(0)  # a render thread inside the rasterizer would abort an interpreter that ends
+        os._exit(0)  # A normal exit would abort in a render thread inside the rasterizer.
 
     sys.excepthook = hook

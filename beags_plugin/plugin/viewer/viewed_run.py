@@ -23,11 +23,11 @@ from beags_plugin.views.views import unique_names
 if TYPE_CHECKING:
     from beags_plugin.plugin.views.datamanager import BeagsDataManager
 
-_KEPT_MASKS = 8  # of the views that were looked at last
+_KEPT_MASKS = 8  # Masks in memory, of the last views.
 
 
 class ViewedRun:
-    """A run on disk with its data manager; the panel calls ``load_grid``, which is slow.
+    """A run on disk with its data manager. The panel calls ``load_grid``, which is slow.
 
     folder: of the run. names: of the training views. cameras: theirs, without lens distortion. grid: the voxel grid of
     a finished run; None until ``load_grid``.
@@ -43,24 +43,24 @@ class ViewedRun:
         self.cameras: list[Camera] = [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
         self.grid: VisibilityGrid | None = None
         self._before = lru_cache(_KEPT_MASKS)(datamanager.files["train"].mask_labels)
-        self.refining: Callable[[], bool] = lambda: True  # see ``prepared``
+        self.refining: Callable[[], bool] = lambda: True  # Whether the scene has been prepared.
         self._after = lru_cache(_KEPT_MASKS)(_read_mask)
         self._kept = digest_of_prepared(folder) if (folder / EXTRACTION_FILE).exists() else None
         self._digest = lru_cache(1)(lambda folder, _changed: files_digest(folder))
 
     @property
     def prepared(self) -> Path | None:
-        """Return the folder that refinement was prepared with: of this run, or of its origin.
+        """Return the folder of the preparation: of this run, or of its origin.
 
-        None while the shown scene has been through no preparation, as a folder that is used again may hold that of a
-        former run, and where the origin of an extracted run has been prepared again.
+        None if the shown scene has not been prepared yet (the folder may hold files of a former run), or if the origin
+        of an extracted run has been prepared again.
         """
         folder = self._folder()
         return None if folder is None or self._replaced(folder) else folder
 
     @property
     def note(self) -> str | None:
-        """Return a sentence for users where the files on disk are no longer those that this scene was prepared with."""
+        """Return a sentence for users if the files on disk no longer belong to this scene's preparation."""
         folder = self._folder()
         if folder is None or not self._replaced(folder):
             return None
@@ -70,23 +70,23 @@ class ViewedRun:
         )
 
     def _folder(self) -> Path | None:
-        """Return the folder of the preparation, if the scene has been through one and it holds anything."""
+        """Return the folder of the preparation if the scene has been prepared and the folder is complete; else None."""
         folder = preparing_run(self.folder) / PREPARED
         return folder if self.refining() and (folder / "grid.pt").exists() else None
 
     def _replaced(self, folder: Path) -> bool:
-        """Return whether the folder has changed since this run was extracted, as far as that is known."""
+        """Return whether the folder has changed since this run was extracted; False if unknown."""
         if self._kept is None:
             return False
         try:
             now = self._digest(folder, (folder / "grid.pt").stat().st_mtime_ns)
-        except OSError:  # it is being replaced
+        except OSError:  # The folder is being replaced.
             return True
         return now != self._kept
 
     @property
     def has_grid(self) -> bool:
-        """Return whether refinement was prepared with a voxel grid (without one some refiners keep an empty file)."""
+        """Return whether refinement was prepared with a voxel grid; without one the file is empty."""
         return self.prepared is not None and bool(grid_state(self.prepared / "grid.pt", mmap=True))
 
     def load_grid(self) -> bool:
@@ -98,8 +98,7 @@ class ViewedRun:
         return self.grid is not None
 
     def mask(self, view: int, kind: str, width: int, height: int) -> Tensor | None:
-        """Return [height, width] int32 ids or IGNORE of a training view, "before" reprojection or "after"; None without
-        one.
+        """Return a training view's mask [height, width] int32 "before" or "after" reprojection; None without one.
 
         Raises ``UserError`` for a file that cannot be read.
         """
@@ -112,5 +111,5 @@ class ViewedRun:
 
 
 def _read_mask(path: Path, _changed: int) -> np.ndarray:
-    """Read a mask; _changed, the time of the file's last change, makes a cache read it again after one."""
+    """Read a mask; with the time of the last change as argument, a cache reads changed files again."""
     return read_id_mask(path)

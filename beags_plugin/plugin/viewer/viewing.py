@@ -1,10 +1,11 @@
-"""Pictures that nerfstudio asks of a model, and further ones of its viewer."""
+"""Render the pictures that nerfstudio requests from a model, and further ones for its viewer."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,7 @@ from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.occupancy.violation import violation_shares
 from beags_plugin.plugin.training.scene_model import SceneModel
-from beags_plugin.plugin.viewer.choice import Choice, Visible, shown
+from beags_plugin.plugin.viewer.choice import Choice, Visible, visible_part
 from beags_plugin.plugin.viewer.pace import Pace
 from beags_plugin.plugin.viewer.pictures import (
     boundary_picture,
@@ -43,13 +44,14 @@ CHANNELS = {
     "mask_before": 3,
     "mask_after": 3,
 }
-"""Pictures beyond those of every run: name to number of channels."""
+"""Additional pictures: name to number of channels."""
 OF_TRAINING_VIEWS = frozenset({"boundary_error", "mask_before", "mask_after"})
+PATIENCE = 5.0  # Seconds that a click waits for the scene.
 NO_CLASSES = "the Gaussians have no classes yet: they get them between base training and refinement."
 
 
-def asked_by_viewer() -> bool:
-    """Return whether nerfstudio's viewer asks; for evaluation and renderers nothing is hidden."""
+def called_by_viewer() -> bool:
+    """Return whether nerfstudio's viewer calls; evaluation and ns-render get the whole scene."""
     return isinstance(threading.current_thread(), RenderStateMachine)
 
 
@@ -59,7 +61,7 @@ def scene_outputs(model: SceneModel, camera: Camera) -> dict[str, Tensor]:
     Each [H, W, 1 or 3] float32: rgb, depth (world units along z), normal, accumulation, background; with classes also
     class_map (colours) and class_confidence (the winner's share).
     """
-    scene = shown(model.surfels(), model.members(), Choice(), inside=within(model, model.crop_box))
+    scene = visible_part(model.surfels(), model.members(), Choice(), inside=within(model, model.crop_box))
     outputs = plain_outputs(model, scene, camera, model.background_color)
     if bool(model.assigned):
         outputs.update(class_outputs(model, scene, camera))
@@ -68,10 +70,10 @@ def scene_outputs(model: SceneModel, camera: Camera) -> dict[str, Tensor]:
 
 @dataclass(frozen=True)
 class Paint:
-    """What has been picked, as a viewer shows it: in colours over those of the scene of N Gaussians.
+    """Colours of picked objects over those of the scene of N Gaussians.
 
-    colors: [N, 3] float32. strength: [N] float32, 0..1, of the colour. only: [N] bool, the Gaussians that are left, or
-    None for all.
+    colors: [N, 3] float32. strength: [N] float32, 0..1, of the colour. only: [N] bool, the Gaussians to render; None:
+    all.
     """
 
     colors: Tensor
@@ -89,11 +91,11 @@ def plain_outputs(
         index = slice(None) if scene.index is None else scene.index
         inputs = replace(inputs, colors=inputs.colors.lerp(paint.colors[index], paint.strength[index][:, None]))
     render = model.rasterizer.rasterize(inputs, camera, model.settings(), background)
-    assert render.depth is not None and render.normal is not None  # the settings ask for geometry
+    assert render.depth is not None and render.normal is not None
     return {
         "rgb": render.color.clamp(0.0, 1.0),
         "depth": render.depth[..., None],
-        "normal": 0.5 - 0.5 * render.normal,  # towards the camera looks bluish, as in other viewers
+        "normal": 0.5 - 0.5 * render.normal,  # Surfaces facing the camera look bluish, as in other viewers.
         "accumulation": render.alpha[..., None],
         "background": background.expand(camera.height, camera.width, 3),
     }
@@ -106,7 +108,7 @@ def class_outputs(model: SceneModel, scene: Visible, camera: Camera) -> dict[str
 
 
 def is_prepared(model: SceneModel) -> bool:
-    """Return whether the scene as it now is was prepared for refinement; a checkpoint shows it by its classes."""
+    """Return whether the present scene was prepared for refinement; a loaded checkpoint was if it has classes."""
     return bool(model.assigned) if model.prepared is None else model.prepared
 
 
@@ -124,16 +126,16 @@ class Shares:
 
 
 class Viewing:
-    """The pictures of a model that a viewer asks for.
+    """Renders the pictures of a model for a viewer.
 
     The panel's threads set ``choice`` and ``shares``; the viewer's render threads call ``outputs``. Nerfstudio raises
     an exception between any two lines of an obsolete rendering, and any other exception ends the render thread for
-    good: so a rendering changes its results by one assignment, and a failure becomes a note.
+    good. So a rendering stores its results by one assignment, and a failure becomes a note.
 
-    background: [3], the viewer's. listed: names of ``CHANNELS`` that this run offers; the same ones as long as a viewer
-    runs. wanted: returns those that it shows now. crop_box: returns the viewer's. run: the run's files. notes: remarks
-    on the pictures of the last rendering. pace: of the rendering. paint: what has been picked. errand: what is to be
-    picked for a program that waits.
+    background: [3], the viewer's. listed: names of ``CHANNELS`` that this run offers, fixed as long as a viewer runs.
+    requested: returns those that are visible now. crop_box: returns the viewer's. run: the run's files. notes: remarks
+    on the pictures of the last rendering. pace: of the rendering. paint: of the picked objects. errand: objects to pick
+    for a waiting program.
     """
 
     def __init__(self, model: SceneModel) -> None:
@@ -141,7 +143,7 @@ class Viewing:
         self.choice = Choice()
         self.background: Tensor | None = None
         self.listed: tuple[str, ...] = ()
-        self.wanted: Callable[[], frozenset[str]] = frozenset
+        self.requested: Callable[[], frozenset[str]] = frozenset
         self.crop_box: Callable[[], OrientedBox | None] = lambda: None
         self.run: ViewedRun | None = None
         self.shares: Shares | None = None
@@ -153,10 +155,10 @@ class Viewing:
         self._rest_until = 0.0
 
     def attach(self, run: ViewedRun, training: bool, lock: threading.Lock | None) -> None:
-        """Begin work with a viewer.
+        """Connect to a viewer.
 
-        run: parts of the run besides its scene. training: whether it is being trained. lock: held by whoever changes
-        the scene, or renders it for the viewer.
+        run: parts of the run besides its scene. training: whether it is being trained. lock: held while the scene is
+        changed, or rendered for the viewer.
         """
         self.lock = lock or self.lock
         run.refining = lambda: is_prepared(self.model)
@@ -173,35 +175,45 @@ class Viewing:
         self.run = run
         self.listed = tuple(name for name in CHANNELS if available[name])
 
-    def shown(self, rest: bool = True) -> Visible:
-        """Return the Gaussians that choice and paint leave; rest: False leaves the faded ones out."""
+    @contextmanager
+    def held_soon(self) -> Iterator[None]:
+        """Hold the lock in the block; raise ``UserError`` if the scene stays busy."""
+        if not self.lock.acquire(timeout=PATIENCE):
+            raise UserError("the scene is busy: click again.")
+        try:
+            yield
+        finally:
+            self.lock.release()
+
+    def visible(self, rest: bool = True) -> Visible:
+        """Return the Gaussians to render by choice and paint; rest: False leaves the faded ones out."""
         model = self.model
         choice = self.choice if bool(model.assigned) else Choice(min_opacity=self.choice.min_opacity)
         inside, paint = within(model, self.crop_box()), self.paint
         if paint is not None and paint.only is not None:
             inside = paint.only if inside is None else inside & paint.only
-        return shown(model.surfels().detach(), model.members(), choice, rest, inside)
+        return visible_part(model.surfels().detach(), model.members(), choice, rest, inside)
 
     def outputs(self, camera: Camera) -> dict[str, Tensor]:
-        """Render every picture that the viewer lists; those that it does not show at present are left black."""
+        """Render every picture that the viewer lists; those that are not visible at present stay black."""
         model, notes = self.model, {}
         started, worked = time.perf_counter(), time.process_time()
-        wanted = self.wanted() & frozenset(self.listed)
-        scene = self.shown()
+        requested = self.requested() & frozenset(self.listed)
+        scene = self.visible()
         background = model.background_color if self.background is None else self.background
         outputs = plain_outputs(model, scene, camera, background, self.paint)
         del outputs["background"]
         black = camera.K.new_zeros(1, 1, 1)
         for name in self.listed:
             outputs[name] = black.expand(camera.height, camera.width, CHANNELS[name])
-        if wanted & {"class_map", "class_confidence"}:
+        if requested & {"class_map", "class_confidence"}:
             if bool(model.assigned):
                 outputs.update(class_outputs(model, scene, camera))
             else:
                 notes["classes"] = f"No class map: {NO_CLASSES}"
-        if "occupancy_violation" in wanted:
+        if "occupancy_violation" in requested:
             outputs.update(self._violation(scene, camera, notes))
-        if names := wanted & OF_TRAINING_VIEWS:
+        if names := requested & OF_TRAINING_VIEWS:
             outputs.update(self._of_training_view(names, scene, camera, notes))
         self.notes = notes
         spent = time.perf_counter() - started, time.process_time() - worked
@@ -211,7 +223,7 @@ class Viewing:
     def _violation(self, scene: Visible, camera: Camera, notes: dict[str, str]) -> dict[str, Tensor]:
         shares = self.shares
         if shares is None or len(shares.values) != self.model.num_points:
-            notes["violation"] = "occupancy_violation: being computed, or there is no voxel grid yet."
+            notes["violation"] = "occupancy_violation is being computed, or there is no voxel grid yet."
             return {}
         values = shares.values if scene.index is None else shares.values[scene.index]
         settings = self.model.settings()
@@ -252,21 +264,21 @@ class Viewing:
         return outputs
 
     def copy(self, rest: bool = True) -> Visible:
-        """Return ``shown`` in memory of its own; waits for the training step, if there is one."""
+        """Return a copy of ``visible``; waits for the training step, if there is one."""
         with self.lock:
-            scene = self.shown(rest)
+            scene = self.visible(rest)
             return Visible(scene.surfels.clone(), scene.class_ids.clone(), scene.index)
 
     def whole(self) -> tuple[Surfels, Membership]:
-        """Return the scene and its classes in memory of their own; waits as ``copy`` does."""
+        """Return a copy of the scene and its classes; waits as ``copy`` does."""
         with self.lock:
             members = self.model.members()
             return self.model.surfels().detach().clone(), Membership(members.class_ids.clone(), members.objects)
 
     def refresh_shares(self) -> bool:
-        """Compute the shares behind ``occupancy_violation``, if the scene has changed; return whether it did.
+        """Compute the shares behind ``occupancy_violation`` if the scene has changed, and return whether it has.
 
-        The work happens outside the lock, so that neither training nor rendering waits, and at most a tenth of the
+        The work happens outside the lock, so that neither training nor rendering waits. It takes at most a tenth of the
         time.
         """
         model = self.model

@@ -1,6 +1,6 @@
-"""A page of a finished run: nothing of a training, and a picture at rest that is as large as the canvas it fills.
+"""Set up the page of a finished run: no controls of training, and pictures at rest as large as the canvas.
 
-viser's camera messages do not tell the size of the canvas, so a script of the page does.
+Viser's camera messages do not contain the size of the canvas, so a script in the page sends it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from viser import GuiEvent, ViserServer
 
 _LABEL = "Canvas of this page"
-_FIRST = 512  # pixels of the longer side, until the page has told its own; nerfstudio's default
-_LARGEST = 2048  # of nerfstudio's slider Max res
+_FIRST = 512  # Pixels of the longer side until the page has sent its own; nerfstudio's default.
+_LARGEST = 2048  # Largest value of nerfstudio's slider Max res.
 _TELL = """
 (() => {
   clearInterval(window.beagsTells);
@@ -37,23 +37,23 @@ _TELL = """
   }, 300);
 })();
 """
-"""A script of the page: it writes the canvas's size into a text field that it hides, whenever that changes."""
+"""Script in the page that writes each change of the canvas's size into a hidden text field."""
 
 
 class Windows:
-    """The sizes of the canvases of all pages of a viewer; ``changed`` is called after one has become known."""
+    """The canvas sizes of all pages of a viewer."""
 
     def __init__(self, viewer: Viewer) -> None:
         self._viewer = viewer
         self._sizes: dict[int, tuple[int, int]] = {}
         server: ViserServer = viewer.viser_server
         field = server.gui.add_text(_LABEL, "")
-        field.on_update(self._told)
+        field.on_update(self._resized)
         script = _TELL.replace("LABEL", json.dumps(_LABEL))
         server.gui._websock_interface.queue_message(_messages.RunJavascriptMessage(script))
-        viewer.control_panel._max_res.value = _LARGEST  # it bounds the canvas's size from now on
+        viewer.control_panel._max_res.value = _LARGEST  # It now only bounds the canvas's size.
 
-    def _told(self, event: GuiEvent) -> None:
+    def _resized(self, event: GuiEvent) -> None:
         try:
             width, height = (int(word) for word in str(event.target.value).split("x"))
         except ValueError:
@@ -63,7 +63,7 @@ class Windows:
             self._viewer._trigger_rerender()
 
     def size(self, client_id: int, aspect: float) -> tuple[int, int]:
-        """Return (height, width) of a page's picture at rest, at most as large as the slider Max res says.
+        """Return (height, width) of a page's picture at rest, bounded by the slider Max res.
 
         aspect: width over height.
         """
@@ -74,12 +74,12 @@ class Windows:
         return max(height, 1), max(round(height * aspect), 1)
 
 
-def shown_finished(viewer: Viewer) -> Windows:
-    """Leave out what nerfstudio shows of a training, and a logo that it loads from the web; return the pages' sizes."""
+def set_up_finished(viewer: Viewer) -> Windows:
+    """Hide nerfstudio's controls of training and a logo that it loads from the web; return the pages' sizes."""
     viewer.pause_train.visible = viewer.resume_train.visible = False
     for control in (viewer.control_panel._train_speed, viewer.control_panel._train_util):
         control.set_hidden(True)
-    # nerfstudio leaves the step of a finished run at 0, so the size is shown alone
+    # Nerfstudio leaves the step of a finished run at 0, so only the size is shown.
     viewer.make_stats_markdown = lambda step, size: f"Resolution: {size}"  # type: ignore[method-assign]
     viewer.stats_markdown.content = ""
     viewer.viser_server.gui.configure_theme(

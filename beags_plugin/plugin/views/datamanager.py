@@ -1,4 +1,4 @@
-"""Data manager: full images, with the labels of each view undistorted like its image."""
+"""Data manager of full images, with the labels of each view undistorted like its image."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from beags_plugin.views.run_data import Split
 from beags_plugin.views.streaming import Lazy, StreamedViews
 from beags_plugin.views.views import View, unique_names
 
-READ_AHEAD = 8  # streamed images that are read before their use
+READ_AHEAD = 8  # Streamed images that are read before their use.
 OWN_KEYS = ("labels", "alpha")
 
 
@@ -54,9 +54,9 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     """nerfstudio's data manager of full images, for CPUs too, with labels in every batch.
 
     Batches hold ``image`` [H, W, 3], ``labels`` [H, W] int32 and ``alpha`` [H, W] uint8 where the image has it, all
-    on the device, and, once ``replace_labels`` was called, ``present``, the objects of ``labels``; with ``photos`` of
-    objects, what ``objects_alone`` adds for training. The cache holds labels in the narrowest type. Training views come
-    in a random order without repetition within a round, given by ``train_cameras_sampling_seed`` alone.
+    on the device, and, once ``replace_labels`` was called, ``present``, the objects of ``labels``; with the option
+    ``photos objects``, what ``objects_alone`` adds for training. The cache holds labels in the narrowest type. Training
+    views come in a random order without repetition within a round, given by ``train_cameras_sampling_seed`` alone.
     """
 
     config: BeagsDataManagerConfig
@@ -70,23 +70,23 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         }  # fmt: skip
         self.train_cameras = self.train_dataset.cameras.to(self.device)
         self._cameras: dict[int, Camera] = {}
-        _ = self.cached_train  # Photos are read now, so that what is wrong with one is said before all else.
-        self.close_ups: CloseUps | None = None  # that training sees, once ``focus`` was called
-        self._present: list[list[int]] | None = None  # objects of each training view's labels, once they are replaced
-        # nerfstudio samples evaluation views by Python's global generator, which others use too.
+        _ = self.cached_train  # Photos are read now, so that a bad one is reported first.
+        self.close_ups: CloseUps | None = None  # Set by ``focus``.
+        self._present: list[list[int]] | None = None  # Objects of each training view's labels, once they are replaced.
+        # Nerfstudio samples evaluation views by Python's global generator, which other code uses too.
         self._eval_order = random.Random(config.train_cameras_sampling_seed)
         self._add_dense_seeds()
 
     def get_datapath(self) -> Path:
-        """Return where a viewer keeps camera paths: in the run that ns-viewer opens, else in the folder of the photos.
+        """Return the folder for a viewer's camera paths: of the run that ns-viewer opens, else of the photos.
 
-        The photos' folder may be somebody else's, or read-only.
+        The photos' folder may belong to somebody else, or be read-only.
         """
         config_path = path_option("--load-config") if program_name() == "ns-viewer" else None
         return super().get_datapath() if config_path is None else config_path.absolute().parent
 
     def focus(self) -> None:
-        """Have training see close-ups of objects from here on, where the option ``focus`` says so."""
+        """Show close-ups of objects to training from here on, if the option ``focus`` says so."""
         config, names = self.config, unique_names(self.train_dataset.image_filenames)
         self.close_ups = focused(
             config.focus,
@@ -97,12 +97,13 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         )
 
     def _add_dense_seeds(self) -> None:
-        """Add seed points that photos agree on, where they are wanted; there are none without points to begin with."""
-        seeds, wanted = self.train_dataparser_outputs.metadata, self.config.dense_seeds
+        """Add seed points on which photos agree, if the option says so and there are points to begin with."""
+        seeds, option = self.train_dataparser_outputs.metadata, self.config.dense_seeds
         few = len(self.train_dataset) <= MOST_PHOTOS and self.config.photos == "all"
-        if self.config.begins and not seeds["points3D_random"] and (wanted == "on" or (wanted == "auto" and few)):
-            found = with_dense_seeds(self.views("train"), seeds["points3D_xyz"], seeds["points3D_rgb"])
-            seeds["points3D_xyz"], seeds["points3D_rgb"] = found
+        if self.config.begins and not seeds["points3D_random"] and (option == "on" or (option == "auto" and few)):
+            seeds["points3D_xyz"], seeds["points3D_rgb"] = with_dense_seeds(
+                self.views("train"), seeds["points3D_xyz"], seeds["points3D_rgb"]
+            )
 
     def _load_images(self, split: Split, cache_images_device: Literal["cpu", "gpu"]) -> Any:
         """Return the data of all views, in memory or streamed."""
@@ -113,9 +114,9 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             workers = self.config.max_thread_workers or min(4, os.cpu_count() or 1)
             return StreamedViews(load, len(dataset), READ_AHEAD, workers)
         with ThreadPoolExecutor(max_workers=self.config.max_thread_workers or 2) as pool:
-            found = pool.map(load, range(len(dataset)))
-            cache = list(track(found, f"Reading {split} images", total=len(dataset), transient=True))
-        # "cpu" pins memory, which needs CUDA; "gpu" means self.device, whatever that is.
+            loaded = pool.map(load, range(len(dataset)))
+            cache = list(track(loaded, f"Reading {split} images", total=len(dataset), transient=True))
+        # Nerfstudio means pinned memory by "cpu", which needs CUDA, and self.device by "gpu".
         pinned = cache_images_device == "cpu" and torch.device(self.device).type != "cpu"
         for data in cache:
             data["image"] = data["image"].pin_memory() if pinned else data["image"].to(self.device)
@@ -144,7 +145,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             self.cached_train.expect(self.train_unseen_cameras)
         metadata = camera.metadata or {}
         index = metadata["cam_idx"]
-        own_camera, data = self._seen(index, data, step)
+        own_camera, data = self._batch_of(index, data, step)
         if own_camera is not self._camera(index):
             take_intrinsics(camera, own_camera)
         own = {"labels": data["labels"], "camera": own_camera, "objects_alone": "inside" in data}
@@ -154,22 +155,22 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             data.setdefault("present", self._present[index])
         return camera, data
 
-    def _seen(self, index: int, held: dict, step: int) -> tuple[Camera, dict]:
-        """Return camera and batch that ``step`` sees of a view whose data are ``held`` in the cache."""
-        if self.close_ups is not None and (drawn := self.close_ups.drawn(index, step)) is not None:
-            camera, data = drawn
+    def _batch_of(self, index: int, cached: dict, step: int) -> tuple[Camera, dict]:
+        """Return camera and batch of a view for ``step``: a close-up or the whole view. cached: its data."""
+        if self.close_ups is not None and (close_up := self.close_ups.drawn(index, step)) is not None:
+            camera, data = close_up
             present = {} if self._present is None else {"present": objects_in(to_int32(data["labels"]))}
             data = self._as_wanted({**data, **present, "image": data["image"].to(self.device)})
             return camera.to(self.device), data
-        return self._camera(index), self._as_wanted(held)
+        return self._camera(index), self._as_wanted(cached)
 
-    def _as_wanted(self, held: dict) -> dict:
-        """Return data on the device, of all that the photo shows or of its objects."""
-        data = self._on_device(held)
+    def _as_wanted(self, cached: dict) -> dict:
+        """Return data on the device, of the whole photo or of its objects alone, as the option ``photos`` says."""
+        data = self._on_device(cached)
         return objects_alone(data) if self.config.photos == "objects" else data
 
     def _camera(self, index: int) -> Camera:
-        """Return a training view's camera, whole, on the device; the host knows its numbers: no step fetches them."""
+        """Return a training view's whole camera on the device; the host has its numbers too, so no step waits."""
         if index not in self._cameras:
             self._cameras[index] = camera_from_nerfstudio(self.train_dataset.cameras, index).to(self.device)
         return self._cameras[index]
@@ -198,8 +199,8 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     # -- the order of the views, in checkpoints ----------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
-        """Return where the orders of the training and evaluation views are; see ``resumable.Resumable``."""
-        generator = getattr(self, "random_generator", None)  # nerfstudio's "fps" has none
+        """Return the state of the orders of training and evaluation views; see ``Resumable``."""
+        generator = getattr(self, "random_generator", None)  # Nerfstudio's sampling "fps" has none.
         epochs = getattr(self, "train_unsampled_epoch_count", None)
         return {
             "sizes": [len(self.train_dataset), len(self.eval_dataset)],
@@ -211,7 +212,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on with the views in the order in which the run that gave ``state`` would have."""
+        """Continue the orders from ``state``."""
         now = [len(self.train_dataset), len(self.eval_dataset)]
         if (began := list(state["sizes"])) != now:
             raise UserError(
@@ -231,7 +232,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     def views(self, split: Literal["train", "val", "test", "eval"], original: bool = False) -> list[View]:
         """Return all views of the training or (any other name) the evaluation split, in name order.
 
-        original: give the labels of the mask files also after ``replace_labels``.
+        original: whether labels come from the mask files even after ``replace_labels``.
         """
         if split not in ("train", "val", "test", "eval"):
             raise ValueError(f"unknown split {split!r}")
@@ -240,8 +241,8 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
 
         def view(index: int, name: str) -> View:
             def data() -> dict[str, Tensor]:
-                held = cache[index]
-                return {key: held[key].to(self.device) for key in ("image", "alpha") if key in held}
+                cached = cache[index]
+                return {key: cached[key].to(self.device) for key in ("image", "alpha") if key in cached}
 
             camera = camera_from_nerfstudio(dataset.cameras, index).to(self.device)
             return View(camera, name, data, partial(self._labels, whose, index, original))
@@ -264,9 +265,9 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     def replace_labels(self, labels: Sequence[Tensor], of_close_ups: Sequence[Tensor] = ()) -> None:
         """Train on the labels M' of reprojected masks instead of those of the mask files (method, section 2).
 
-        ``next_train`` gives those of its view [H, W] int32 to the model in ``camera.metadata["labels"]``, since the
-        rasterizer, which sees no batch, renders the class boundary against them. labels: [H, W] integers of each
-        training view. of_close_ups: of each of ``close_up_views``. Raises ``ValueError`` if their number, a size or an
+        ``next_train`` passes them to the model in ``camera.metadata["labels"]`` too, since the rasterizer, which gets
+        no batch, renders the class boundary against them. labels: [H, W] integers of each training view. of_close_ups:
+        the same of each of ``close_up_views``. Raises ``ValueError`` if their number, a size or an
         id (0..IGNORE) is wrong.
         """
         cache, cameras = self.cached_train, self.train_dataset.cameras

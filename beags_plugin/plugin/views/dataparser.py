@@ -20,8 +20,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
-from beags_plugin.plugin.views.ns_programs import prepare_reading
-from beags_plugin.plugin.views.ns_train import prepare
+from beags_plugin.plugin.views.ns_programs import prepare_reading, prepare_training
 from beags_plugin.system.errors import print_user_errors_plainly
 from beags_plugin.views.cameras import SceneCameras
 from beags_plugin.views.data_options import DataOptions
@@ -36,7 +35,7 @@ class BeagsDataParserConfig(DataOptions, DataParserConfig):
 
 
 class PlacedOutputs(DataparserOutputs):
-    """nerfstudio's outputs with a ``dataparser_transform`` [3, 4] in double precision, by which cameras go back too."""
+    """nerfstudio's outputs with ``dataparser_transform`` [3, 4] in double precision, which also inverts poses."""
 
     def transform_poses_to_original_space(
         self, poses: Tensor, camera_convention: Literal["opengl", "opencv"] = "opencv"
@@ -50,12 +49,12 @@ class PlacedOutputs(DataparserOutputs):
 
 
 class BeagsDataParser(SceneData, DataParser):
-    """Parser behind ``beags-data``: ``SceneData`` with nerfstudio's outputs, whose metadata are its ``SplitData``'s."""
+    """Parser behind ``beags-data``: ``SceneData`` with nerfstudio's outputs; metadata are those of ``SplitData``."""
 
     config: BeagsDataParserConfig
 
     def __init__(self, config: BeagsDataParserConfig) -> None:
-        print_user_errors_plainly()  # under other methods too
+        print_user_errors_plainly()  # Other methods may use this parser too.
         DataParser.__init__(self, config)
         SceneData.__init__(self, config)
 
@@ -72,15 +71,15 @@ class BeagsDataParser(SceneData, DataParser):
 
 
 def nerfstudio_cameras(cameras: SceneCameras) -> Cameras:
-    """Return cameras as nerfstudio has them."""
+    """Return nerfstudio's cameras."""
     return Cameras(**{each.name: getattr(cameras, each.name) for each in fields(cameras)})
 
 
 def __getattr__(name: str) -> DataParserSpecification:
-    """Return the target of nerfstudio's entry point, ``beags_data``, which the first program to ask for it prepares."""
+    """Return ``beags_data``, the target of nerfstudio's entry point, after preparing the program that reads it."""
     if name != "beags_data":
         raise AttributeError(name)
-    prepare()
+    prepare_training()
     prepare_reading()
     return DataParserSpecification(
         config=BeagsDataParserConfig(),

@@ -12,14 +12,14 @@ from beags_plugin.views.split_photos import SplitPhotos
 class BeagsDataset(SplitPhotos, InputDataset):
     """Views of one split, as ``SplitPhotos`` reads them: ``image`` [H, W, 3] and ``labels`` [H, W] uint16.
 
-    scale_factor: of the data manager's ``camera_res_scale_factor``, on top of the parser's downscale factor.
+    scale_factor: the data manager's ``camera_res_scale_factor``; it multiplies the parser's downscale factor.
     """
 
     cameras: Cameras
     exclude_batch_keys_from_device = ["image", "mask", "labels", "alpha"]
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
-        # without the factor, as nerfstudio rounds the size down but scales K exactly
+        # The factor is not passed on, because nerfstudio rounds the size down but scales K exactly.
         InputDataset.__init__(self, dataparser_outputs)
         if scale_factor != 1.0:
             self.scale_factor = scale_factor

@@ -37,7 +37,7 @@ def test_every_option_of_ours_has_a_text(help_text, monkeypatch):
         start = help_text.index(f" --{flag} ")
         text = help_text[start : help_text.index("(default:", start)]
         if ".options." in flag:  # one text above all options of losses
-            assert f"{name}, " in help_text[help_text.index("Of the loss itself.") :], option
+            assert f"{name}, " in help_text[help_text.index("Options of the loss itself.") :], option
         else:
             assert len(text.split()) > 5, text  # the flag, its kind, and a sentence
 

@@ -13,10 +13,10 @@ pytest.importorskip("nerfstudio")
 from beags_plugin.losses import LOSSES
 from beags_plugin.plugin import methods
 from beags_plugin.plugin.options.config import BeagsTrainerConfig, base_config
-from beags_plugin.plugin.presets import load_preset, override, preset_files, preset_folder, preset_names
+from beags_plugin.plugin.presets import load_preset, override, preset_files, preset_names
 from beags_plugin.refiners import REFINERS
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.shipped import read_toml
+from beags_plugin.system.shipped import read_toml, shipped_folder
 
 
 def write(folder, text):
@@ -53,7 +53,7 @@ def test_the_papers_preset_pins_every_choice_that_is_an_option():
     rows = (ROOT / "docs/method.md").read_text("utf-8").split("## 11. ")[1].split("|---|---|---|")[1].splitlines()
     switches = [row.split("|")[3] for row in rows if row and not row.startswith("| `beags-")]
     options = set(re.findall(r"`(near|far|prepare\.\w+)", " ".join(switches)))
-    pinned = read_toml(preset_folder() / "beags-paper.toml", "preset")["overrides"]
+    pinned = read_toml(shipped_folder("method_configs") / "beags-paper.toml", "preset")["overrides"]
     assert {"near", "prepare.tau"} <= options
     assert {f"pipeline.model.{option}" for option in options} <= set(pinned)
 
@@ -97,7 +97,7 @@ def test_a_preset_takes_the_overrides_of_the_one_it_is_like(tmp_path):
     assert (spec.config.pipeline.model.base_steps, spec.config.pipeline.model.refine_steps) == (7, 9)
     assert [path.stem for path in preset_files("third", tmp_path)] == ["third", "second", "first"]
     (tmp_path / "first.toml").write_text("description='x'\nlike='third'")
-    with pytest.raises(UserError, match="is like itself by way of .*first.toml: take a like away"):
+    with pytest.raises(UserError, match="is like itself through .*first.toml: remove one entry like"):
         load_preset("third", tmp_path)
 
 

@@ -98,7 +98,7 @@ def test_a_shorter_run_has_the_same_proportions_but_no_shorter_intervals_than_it
         300,
     )
     never = DensifyConfig(reset_every=0, prune_scale_after=0, every=30).scaled(0.1)
-    # what is stated shorter than the bound stays as stated
+    # Steps stated shorter than the bound stay as stated.
     assert (never.reset_every, never.prune_scale_after, never.every) == (0, 0, 30)
     assert DensifyConfig(prune_scale_after=3).scaled(0.1).prune_scale_after == 1  # 0 would be never
 
@@ -163,7 +163,7 @@ def test_official_learning_rates(model):
         rates(step)
         return {group["name"]: group["weight_decay"] for group in adam.param_groups if group["weight_decay"]}
 
-    for name, own in (("features_rest", 0.5), ("scales", 0.25)):  # of the group itself, in all steps
+    for name, own in (("features_rest", 0.5), ("scales", 0.25)):  # The group's own factor holds in all steps.
         configs[name]["optimizer"].weight_decay = own
     assert decays(0) == decays(30_000) == {"features_rest": 0.5, "scales": 0.25}
     for name in ("features_rest", "scales"):

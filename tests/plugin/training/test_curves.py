@@ -99,7 +99,7 @@ def test_every_curve_and_picture_is_in_the_event_file(run):
     for tag in refining:
         assert all(event.step >= STEPS[0] - 1 and 0.0 <= event.value <= 1.0 for event in scalars[tag]), tag
     iou = {name: [(e.step, e.value) for e in scalars[f"Extracted IoU/{name}"]] for name in ("cup", "box", "mean")}
-    assert [step for step, _ in iou["mean"]] == [44, 49, 54, LAST]  # after assignment, every 5, after the last
+    assert [step for step, _ in iou["mean"]] == [44, 49, 54, LAST]  # The first, every 5th, and the last.
     assert all(0.0 <= value <= 1.0 for each in iou.values() for _, value in each)
     parts = {"data", "rendering", "losses", "backward", "optimizer", "growth"}
     assert {f"Seconds per step/{part}" for part in parts} <= set(scalars)
@@ -140,7 +140,7 @@ def kill_and_resume(config, monkeypatch, where):
     resume_in_another_second(config.run_dir)
 
 
-@pytest.mark.parametrize("at", [5, 26])  # before the first checkpoint, after it
+@pytest.mark.parametrize("at", [5, 26])  # These steps lie before and after the first checkpoint.
 def test_a_resumed_run_has_each_step_once(data, tmp_path, monkeypatch, at):
     run = tmp_path / "run"
     config = short_config(data, run)
@@ -182,7 +182,7 @@ def wandb_history(folder):
     (file,) = folder.rglob("*.wandb")
     store, history = DataStore(), {}
     store.open_for_scan(str(file))
-    with suppress(AssertionError):  # of a record that is not whole yet
+    with suppress(AssertionError):  # A record may be incomplete as yet.
         while (data := store.scan_data()) is not None:
             record = wandb_internal_pb2.Record()
             record.ParseFromString(data)

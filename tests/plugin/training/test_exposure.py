@@ -342,7 +342,7 @@ def test_burnt_out_pixels_are_no_colours_of_a_surface(whole):
     assert burnt[2].sum() >= 12
     for exposures in (shown.exposures, None):
         scene = replace(shown, exposures=exposures)
-        vars(scene)["photos"] = [SimpleNamespace(image=image) for image in images]  # which are read only once
+        vars(scene)["photos"] = [SimpleNamespace(image=image) for image in images]  # They are read only once.
         for view, photo in enumerate(photos_of(scene, None, part, Frame.of_run())):
             expected = ~burnt[view] if exposures is not None else torch.ones_like(burnt[view])
             assert torch.equal(photo.own(), expected)

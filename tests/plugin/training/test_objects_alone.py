@@ -37,7 +37,7 @@ from beags_plugin.plugin.presets import preset_config
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.runs.prepared import photos_contradict
-from beags_plugin.runs.read import raster_settings, read_run
+from beags_plugin.runs.read import read_run
 from beags_plugin.views.objects_alone import objects_alone, of_objects
 
 # masks as they are: a pixel that the vote gives to an object would have the photo's say
@@ -75,7 +75,7 @@ def test_what_surrounds_objects_changes_no_bit_and_a_killed_run_ends_alike(folde
         resume_to_end(run)
     resume_to_end(run)
     found = differences(*(without_clocks(checkpoint_of(each)) for each in (run, folders / "run")))
-    assert found and all(place.endswith("train_psnr") for place in found)  # of whole photos
+    assert found and all(place.endswith("train_psnr") for place in found)  # It is measured on whole photos.
 
 
 def test_black_objects_are_solid_and_nothing_else_is(folders):
@@ -86,7 +86,7 @@ def test_black_objects_are_solid_and_nothing_else_is(folders):
         camera = view.camera
         with torch.no_grad():
             inputs = surfel_inputs(scene.surfels(), camera)
-            alpha = make_rasterizer("auto").rasterize(inputs, camera, raster_settings(scene), torch.zeros(3)).alpha
+            alpha = make_rasterizer("auto").rasterize(inputs, camera, scene.settings, torch.zeros(3)).alpha
         inside = (view.visible != 0) & (view.visible != IGNORE)
         assert alpha[inside].mean() > 0.6 and alpha[view.visible == 0].mean() < 0.1, (
             alpha[inside].mean(),

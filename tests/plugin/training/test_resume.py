@@ -57,7 +57,7 @@ def test_the_run_grows_and_prepares(whole):
     assert saved["beags"]["parts"]["refinement"] == {"prepared": True, "evaluated": True}
 
 
-# after growth, in the last base step, in the first step of refinement; elsewhere in the test of many kills
+# The steps are after growth, the last of the base and the first of refinement; the test of many kills has others.
 @pytest.mark.parametrize(("step", "after"), [(36, True), (44, True), (45, False)])
 def test_a_killed_run_ends_as_the_whole_one(data, whole, tmp_path, monkeypatch, step, after):
     run = tmp_path / "run"
@@ -200,7 +200,7 @@ def test_a_real_kill(data, whole, tmp_path):
         "from beags_plugin.plugin.trainer import BeagsTrainer\n"
         "train = BeagsTrainer.train_iteration\n"
         "def slow(self, step):\n"
-        "    time.sleep(600 if step == 50 else 0.02)\n"  # until the kill
+        "    time.sleep(600 if step == 50 else 0.02)\n"  # It waits for the kill.
         "    return train(self, step)\n"
         "BeagsTrainer.train_iteration = slow\n"
         f"run_to_end(short_config(Path({str(data)!r}), Path({str(run)!r})))"

@@ -17,7 +17,7 @@ pytest.importorskip("nerfstudio")
 from test_warm_start import started
 
 from beags_plugin.importers.base import read_scene
-from beags_plugin.plugin.training.start_axes import quarter_turns
+from beags_plugin.plugin.training.warm_start import quarter_turns
 from beags_plugin.splat_io.frames import to_input_frame
 
 C0 = 0.28209479177387814

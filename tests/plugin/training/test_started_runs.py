@@ -78,7 +78,7 @@ def test_a_finished_run_is_replaced_only_if_asked_for(data, whole, tmp_path, mon
     interrupted(data, run, monkeypatch, lambda patch: kill_at(patch, 5), overwrite=True)
     with pytest.raises(UserError, match="holds a run"):  # its checkpoint is in replaced_models
         run_to_end(short_config(data, run))
-    assert "overwrite: false" in (run / "config.yml").read_text()  # for ns-train --load-config
+    assert "overwrite: false" in (run / "config.yml").read_text()  # ns-train --load-config reads it.
 
 
 def test_a_refused_start_in_the_folder_of_another_run_changes_nothing_there(data, whole, tmp_path):
@@ -107,7 +107,7 @@ def test_a_run_that_is_training_is_left_alone(data, whole, tmp_path, again):
     (run / ".half.part").touch()
     before = contents(run)
     with open(run / LOCK, "ab") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # as another process would
+        fcntl.flock(file, fcntl.LOCK_EX)  # Another process would do this.
         with pytest.raises(UserError, match="being trained by another process"):
             resume_to_end(run) if again == "resume" else run_to_end(short_config(data, run, steps_per_save=99))
     assert contents(run) == before
@@ -189,6 +189,6 @@ def test_what_cannot_be_resumed_is_refused_in_one_sentence(data, whole, tmp_path
         read_run(run / "config.yml")  # extract, export, render and eval too
     path.write_bytes(content)
     edit_checkpoint(run, lambda content: content.pop("beags"))
-    resume_to_end(run)  # of an older version: it goes on all the same
+    resume_to_end(run)  # A run of an older version continues all the same.
     assert "older version of beags" in capsys.readouterr().out
     assert checkpoint_of(run)["step"] == LAST

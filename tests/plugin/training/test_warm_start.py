@@ -126,7 +126,7 @@ def test_a_wrong_frame_is_reported_with_the_figure_and_the_frame_that_fits(scene
     right = write_splatfacto(tmp_path / "a", scene.surfels, (torch.eye(4)[:3], 1.0))
     trainer, _ = started(scene, tmp_path / "right", right)
     capsys.readouterr()
-    normalised = tmp_path / "normalised.ply"  # as ns-export writes them
+    normalised = tmp_path / "normalised.ply"  # ns-export writes such files.
     write_ply(normalised, trainer.pipeline.model.surfels().detach())
     _, report = started(scene, tmp_path / "wrong", normalised)
     output = " ".join(capsys.readouterr().out.split())

@@ -88,7 +88,7 @@ def test_a_length_between_two_clicks_gives_the_export_its_size(served):
     config, _, page = served
     page.open_tab("Size")
     page.tick("Click two points")
-    enough = marked(picture(page)) + 0.0001  # where a red block meets a blue one, pixels are pink too
+    enough = marked(picture(page)) + 0.0001  # Pixels between a red and a blue block are pink too.
     page.click(*middle_of(page, RED))
     page.wait_for_text("B is missing")
     first = awaited(page, lambda now: marked(now) > enough)
@@ -120,7 +120,7 @@ def test_a_length_between_two_clicks_gives_the_export_its_size(served):
     page.wait_for_text("Tick Click two points")
     awaited(page, lambda now: marked(now) < (enough + marked(first)) / 2)
     page.open_tab("Pick")
-    page.tick("Click to pick")  # as it was
+    page.tick("Click to pick")  # It was ticked before.
 
 
 def test_objects_are_picked_saved_refined_and_kept(served):

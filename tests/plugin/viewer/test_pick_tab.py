@@ -130,10 +130,10 @@ def test_only_what_is_picked_is_shown_and_exported(opened):
     click(tab, POINTS["high"], "Gaussians")
     tab.work.show_alone(True)
     end = time.monotonic() + 60
-    while len(tab.viewing.shown().surfels) == len(OWNER):
+    while len(tab.viewing.visible().surfels) == len(OWNER):
         assert time.monotonic() < end
         time.sleep(0.01)
-    assert torch.equal(tab.viewing.shown().index, tab.work.picks.chosen.members.nonzero()[:, 0])
+    assert torch.equal(tab.viewing.visible().index, tab.work.picks.chosen.members.nonzero()[:, 0])
     press(tab, tab.files.start, "Exported to")
     surfels, _ = read_ply(config.parent / "exports/picked_object_1.ply")
     exact = solids(COLOURED)[0].means[tab.work.picks.chosen.members]

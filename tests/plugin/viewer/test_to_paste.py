@@ -18,7 +18,7 @@ from run_folders import write_scene, write_trained
 from viewer_windows import Window
 
 from beags_plugin.objects.render import read_camera_path
-from beags_plugin.plugin.viewer.to_paste import show_to_paste, to_paste
+from beags_plugin.plugin.viewer.legend import show_to_paste, to_paste
 
 
 class Page:

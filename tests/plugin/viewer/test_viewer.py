@@ -271,11 +271,11 @@ def test_odd_names_and_classes_that_come_later(window):
     panel.act("Isolate")
     assert "no classes yet" in panel.notes["object"] and model.viewing.choice == Choice()
     panel.clicked(ViewerClick((3.0, 0.0, 0.3), (-1.0, 0.0, -0.1), (0.5, 0.5)))
-    panel.choose(Choice().isolate(1))  # as a choice made before a change of the scene
+    panel.choose(Choice().isolate(1))  # This choice precedes a change of the scene.
     for name in CHANNELS:
         assert window.look(name)["rgb"].isfinite().all()
     assert "no classes yet" in window.model.viewing.notes.get("classes", "no classes yet")
-    assert len(model.viewing.shown().surfels) == model.num_points
+    assert len(model.viewing.visible().surfels) == model.num_points
     assert panel.files.write().exists()
     model.assigned.fill_(True)
     model.set_extra_state(classes)

@@ -19,7 +19,7 @@ from beags_plugin.objects.extract import extract_objects
 from beags_plugin.splat_io.ply import read_ply, write_ply
 
 pytestmark = [NEEDED, pytest.mark.slow("a browser watches whole trainings")]
-STEPS = 60, 240  # of base and refinement
+STEPS = 60, 240  # Steps of base and refinement.
 
 
 def step_of(page: Page) -> int:

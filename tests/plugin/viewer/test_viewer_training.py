@@ -31,7 +31,7 @@ def test_a_training_that_is_watched_ends_as_it_does_unwatched(short_run, tmp_pat
     after, iteration, last = BeagsTrainer._after_train, BeagsTrainer.train_iteration, {}
 
     def first_watched(self, step):
-        if step in (1, STEPS[0]):  # in either phase: else so short a run would be over before a picture is drawn
+        if step in (1, STEPS[0]):  # Else so short a run would be over before a picture is drawn.
             self.train_lock.release()
             try:
                 assert client.wait_for_a_picture()

@@ -20,7 +20,7 @@ from beags_plugin.labels.colors import colorize
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.occupancy.violation import violation_shares
 from beags_plugin.plugin.viewer.aim import frame_of, place, side_of_photos
-from beags_plugin.plugin.viewer.choice import Choice, shown
+from beags_plugin.plugin.viewer.choice import Choice, visible_part
 from beags_plugin.plugin.viewer.legend import (
     WORDS_APART,
     LegendRow,
@@ -72,7 +72,7 @@ def joined(*parts: Surfels) -> Surfels:
 
 def test_nothing_chosen_shows_everything_without_copying():
     surfels, ids = discs()
-    scene = shown(surfels, Membership(ids), Choice(faded_opacity=0.3))
+    scene = visible_part(surfels, Membership(ids), Choice(faded_opacity=0.3))
     assert scene.surfels is surfels and scene.index is None
 
 
@@ -95,7 +95,7 @@ def test_nothing_chosen_shows_everything_without_copying():
 )
 def test_choices_leave_these_classes(choice, classes):
     surfels, ids = discs()
-    scene = shown(surfels, Membership(ids), choice)
+    scene = visible_part(surfels, Membership(ids), choice)
     index = torch.arange(len(ids)) if scene.index is None else scene.index
     assert set(scene.class_ids.tolist()) == classes
     assert index.tolist() == [i for i, class_id in enumerate(ids.tolist()) if class_id in classes]
@@ -107,13 +107,13 @@ def test_choices_leave_these_classes(choice, classes):
 def test_the_rest_fades_and_what_is_removed_stays_away():
     surfels, ids = discs()
     choice = Choice(faded_opacity=0.25).isolate(1).remove(2)
-    scene = shown(surfels, Membership(ids), choice)
+    scene = visible_part(surfels, Membership(ids), choice)
     before = opacities(surfels.opacity_logits)[scene.index]
     factor = torch.where(scene.class_ids == 1, 1.0, 0.25)
     assert set(scene.class_ids.tolist()) == {0, 1}
     torch.testing.assert_close(opacities(scene.surfels.opacity_logits), before * factor, rtol=1e-5, atol=1e-6)
-    assert set(shown(surfels, Membership(ids), choice, rest=False).class_ids.tolist()) == {1}
-    assert shown(surfels, Membership(ids), Choice(faded_opacity=1.0).hide(1)).surfels.opacity_logits.equal(
+    assert set(visible_part(surfels, Membership(ids), choice, rest=False).class_ids.tolist()) == {1}
+    assert visible_part(surfels, Membership(ids), Choice(faded_opacity=1.0).hide(1)).surfels.opacity_logits.equal(
         surfels.opacity_logits
     )
 
@@ -121,10 +121,10 @@ def test_the_rest_fades_and_what_is_removed_stays_away():
 def test_the_least_opacity_and_a_crop_box_leave_surfels_out():
     surfels = joined(wall(0.0, opacity=0.2), wall(1.0, opacity=0.6), wall(2.0, opacity=0.9))
     ids = torch.tensor([0, 1, 1], dtype=torch.int32)
-    assert shown(surfels, Membership(ids), Choice(min_opacity=0.5)).index.tolist() == [1, 2]
+    assert visible_part(surfels, Membership(ids), Choice(min_opacity=0.5)).index.tolist() == [1, 2]
     inside = torch.tensor([True, True, False])
-    assert shown(surfels, Membership(ids), Choice(min_opacity=0.5), inside=inside).index.tolist() == [1]
-    assert shown(surfels, Membership(ids), Choice(min_opacity=1.0)).index.tolist() == []
+    assert visible_part(surfels, Membership(ids), Choice(min_opacity=0.5), inside=inside).index.tolist() == [1]
+    assert visible_part(surfels, Membership(ids), Choice(min_opacity=1.0)).index.tolist() == []
 
 
 # -- picking -----------------------------------------------------------------------------------------------------------
@@ -198,7 +198,7 @@ def test_a_view_fits_into_any_picture_and_sees_the_same(width, height):
     fitted = fitted_camera(camera, width, height)
     assert 1 <= fitted.width <= width and 1 <= fitted.height <= height
     assert fitted.width == width or fitted.height == height
-    corner = torch.tensor([0.5 * 32, 0.25 * 24, 1.0])  # of the view; the same share of the fitted one
+    corner = torch.tensor([0.5 * 32, 0.25 * 24, 1.0])  # The corner has the same place in both views.
     ray = torch.linalg.inv(camera.K) @ corner
     there = fitted.K @ ray
     assert there.tolist() == pytest.approx([0.5 * fitted.width, 0.25 * fitted.height, 1.0], rel=1e-5)

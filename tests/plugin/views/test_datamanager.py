@@ -68,7 +68,7 @@ def test_every_label_comes_from_the_pixel_that_the_image_came_from(tmp_path, mod
     labels = undistort_labels((rows * LARGE_W + columns).astype(np.uint16), cameras, straight, 0)
     assert labels.shape == ramps.shape[:2]
     known = labels != IGNORE
-    inside = known & (ramps[..., 0] > 1) & (ramps[..., 1] > 1)  # at the border the ramp blends with black
+    inside = known & (ramps[..., 0] > 1) & (ramps[..., 1] > 1)  # The ramp blends with black at the border.
     inside &= (ramps[..., 0] < LARGE_W - 2) & (ramps[..., 1] < LARGE_H - 2)
     assert inside.mean() > 0.9
     # OpenCV interpolates at 1/32 pixel, so the nearest pixel is within 0.5 + 1/64 of the ramp.
