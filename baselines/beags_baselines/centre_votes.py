@@ -59,7 +59,7 @@ def members(
         unlabelled[places[label == IGNORE]] += 1
         keys = (places * num_classes + label)[(label != IGNORE) & (label != BACKGROUND)]
         found.add(keys, torch.ones_like(keys, dtype=torch.float64))
-    keys, counts = found.found()
+    keys, counts = found.totals()
     rows = keys // num_classes
     if votes == "all":
         asked = len(views) - unlabelled.double()[rows]

@@ -47,4 +47,4 @@ def labels_by_majority(
         found = mask[row, column].long()
         keys = (seen * num_classes + found)[found != IGNORE]
         votes.add(keys, torch.ones_like(keys, dtype=torch.float64))
-    return labels_by_weight(*votes.found(), len(points), num_classes)
+    return labels_by_weight(*votes.totals(), len(points), num_classes)

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from beags_plugin.core.densification import SH_C0
+from beags_plugin.core.sh import SH_C0
 from beags_plugin.export.base import Exporter
 from beags_plugin.export.splat_values import SplatValues, smallest_three, splat_values
 from beags_plugin.splat_io.files import whole_file

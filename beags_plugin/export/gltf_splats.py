@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beags_plugin.core.densification import SH_C0
+from beags_plugin.core.sh import SH_C0
 from beags_plugin.core.surfels import Surfels, opacities
 from beags_plugin.export.base import Exporter
 from beags_plugin.export.glb import add_mesh

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from beags_plugin.core.densification import SH_C0
+from beags_plugin.core.sh import SH_C0
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.surfaces.close_up import close_up

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beags_plugin.core.densification import SH_C0
+from beags_plugin.core.sh import SH_C0
 from beags_plugin.core.surfels import Surfels, opacities
 from beags_plugin.export.base import Exporter
 from beags_plugin.export.gltf import y_up

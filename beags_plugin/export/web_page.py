@@ -15,8 +15,8 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from beags_plugin.core.densification import SH_C0
 from beags_plugin.core.rotations import rotation_from_quat
+from beags_plugin.core.sh import SH_C0
 from beags_plugin.export.base import Exporter
 from beags_plugin.export.page_colors import SeenColors, seen_colors
 from beags_plugin.export.splat_values import SplatValues, splat_values

@@ -29,7 +29,7 @@ from beags_plugin.objects.extract import (
 from beags_plugin.objects.pose import metres_per_unit
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.runs.run import Run
-from beags_plugin.splat_io.far_worlds import local_origin, said_of_far, unlist, write_origin
+from beags_plugin.splat_io.far_worlds import far_world_note, local_origin, unlist, write_origin
 from beags_plugin.splat_io.files import whole_file
 from beags_plugin.surfaces.frames import check_placement
 from beags_plugin.surfaces.item import ExportItem
@@ -124,7 +124,7 @@ def export_run(
     if job.shift is not None:
         say(_far(folder, job.shift, [file for one in exported for file in one.files if file.path is not None]))
     elif origin is not None and placement == "world" and not pose.centre:
-        say(said_of_far(origin, False, False))
+        say(far_world_note(origin, False, False))
     if everything:
         empty = empty_objects(scene, run.folder)
         world = "run" if transform is None else "input"
@@ -148,7 +148,7 @@ def _far(folder: Path, origin: Tensor, files: Sequence[ExportedFile]) -> str:
     others = [file.path.name for file in files if file.path is not None and "origin" in file.facts]
     if others:
         write_origin(folder, origin, others)
-    return said_of_far(origin, len(others) < len(files), bool(others))
+    return far_world_note(origin, len(others) < len(files), bool(others))
 
 
 def _clear_up(folder: Path, names: Set[str] | None) -> None:

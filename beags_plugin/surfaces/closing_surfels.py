@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beags_plugin.core.densification import SH_C0
 from beags_plugin.core.lifting import project
 from beags_plugin.core.rotations import rotation_from_quat
+from beags_plugin.core.sh import SH_C0
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.surfaces.closing import Closed
