@@ -34,8 +34,8 @@ from beags_plugin.preparation.consistent_masks import (
 from beags_plugin.preparation.refiner import AssignedScene, Refiner
 from beags_plugin.preparation.summary import assignment_summary, reprojection_summary
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
-from beags_plugin.rasterizers.rendering import check_surface_depth
-from beags_plugin.system.errors import UserError
+from beags_plugin.rasterizers.rendering import SURFACE_DEPTHS
+from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.filed_tensors import filed
 
 LEAST_K = 10  # nearer neighbours measure the noise of the depth rather than the distance of points
@@ -66,7 +66,7 @@ class PreparationConfig:
         REPROJECTIONS.check(self.reprojection, AUTO, "none")
         if self.reprojection not in (AUTO, "none"):
             REPROJECTIONS.get(self.reprojection)  # that of another package may not load
-        check_surface_depth(self.depth)
+        check_choice(self.depth, SURFACE_DEPTHS, "surface depth")
         if not self.tau >= 0:
             raise UserError(f"tau is {self.tau}: it must be 0 or more (inf counts every vote).")
         if not self.k >= 1:

@@ -1,6 +1,6 @@
-"""Numbers of pairs, of a tile and a surfel that reaches it, in renders on GPUs.
+"""Numbers of pairs (a tile and a surfel that reaches it) in renders on GPUs.
 
-Only the GPU knows them. The host guesses from earlier renders, so that there is memory before the number arrives.
+The GPU counts them. The host guesses the number from earlier renders, to allocate memory before it arrives.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_FADING = 0.98  # of the largest number of pairs so far, in each render
-_SPARE = 1.25  # memory for this many times the pairs of the largest render so far
-_STEP = 1 << 14  # pairs, or an eighth of the power of two below: few different sizes leave torch's allocator no holes
+_FADING = 0.98  # factor per render on the largest number of pairs so far
+_SPARE = 1.25  # factor from the expected pairs to the allocated ones
+_STEP = 1 << 14  # pairs, or an eighth of the power of two below: few distinct sizes do not fragment torch's allocator
 
-Place = tuple[torch.device, int]  # a GPU and a thread: a viewer's renders change nothing of a training
+Place = tuple[torch.device, int]  # a GPU and a thread, so that a viewer's renders do not affect a training
 
 
 @dataclass
 class Sent:
-    """A render's numbers on their way to the host: of pairs, and of surfels that are not finite."""
+    """A render's numbers of pairs and of surfels that are not finite, on their way to the host."""
 
     numbers: Tensor
     event: Any
@@ -43,7 +43,7 @@ class PairCounts:
         return device, get_ident()
 
     def guess(self, place: Place) -> float | None:
-        """Return the number to expect; None before the first render there."""
+        """Return the number to expect; None before the first render at this place."""
         return self._largest.get(place)
 
     def learn(self, place: Place, pairs: int) -> None:
@@ -54,14 +54,14 @@ class PairCounts:
         """Start to copy the two numbers of a render to the host."""
         if not totals.is_cuda:
             return Sent(totals, None)
-        numbers = torch.empty(2, dtype=torch.int64, pin_memory=True)  # torch keeps such memory for the next ones
+        numbers = torch.empty(2, dtype=torch.int64, pin_memory=True)  # torch reuses pinned memory.
         numbers.copy_(totals, non_blocking=True)
         event = torch.cuda.Event()
         event.record()
         return Sent(numbers, event)
 
     def receive(self, sent: Sent) -> tuple[int, int]:
-        """Wait for the numbers: of pairs, and of surfels that are not finite."""
+        """Wait for the numbers of pairs and of surfels that are not finite."""
         if sent.event is not None:
             sent.event.synchronize()
         pairs, nonfinite = sent.numbers.tolist()
