@@ -50,15 +50,25 @@ def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def pixels_under(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Return which points lie inside the image and in front of the camera, and in which pixels.
+    """Return the points inside the image and in front of the camera, and their pixels.
 
     points: [P, 3] float. Returns three tensors [S] int64: indices of the points, ascending; rows; columns.
     """
-    xy, z = project(points, camera)
-    inside = (z > 0) & (xy >= 0).all(dim=-1) & (xy[:, 0] < camera.width) & (xy[:, 1] < camera.height)
+    inside, row, column, _ = pixels_of(points, camera)
     places = inside.nonzero()[:, 0]
-    column, row = xy[places].long().unbind(dim=-1)
-    return places, row, column
+    return places, row[places], column[places]
+
+
+def pixels_of(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return which points lie inside the image and in front of the camera, and the pixels and depths of all.
+
+    points: [P, 3] float. Returns inside [P] bool; rows and columns [P] int64, any in the image where not inside; z [P].
+    """
+    xy, z = project(points, camera)
+    limit = torch.tensor([camera.width, camera.height], device=xy.device)
+    inside = (z > 0) & ((xy >= 0) & (xy < limit)).all(dim=-1)
+    column, row = xy.nan_to_num().floor().long().clamp(min=0).minimum(limit - 1).unbind(dim=-1)
+    return inside, row, column, z
 
 
 def project_directions(directions: Tensor, points: Tensor, camera: Camera) -> Tensor:

@@ -125,9 +125,7 @@ class TorchRasterizer(Rasterizer, OptionalProducts):
     ) -> tuple[Tensor, Tensor]:
         def largest(weights: Tensor) -> Tensor:
             first = torch.where((weights > 0).cumsum(dim=-1) <= within, weights, torch.zeros_like(weights))
-            rank = first.sort(dim=-1, descending=True, stable=True).indices.argsort(
-                dim=-1
-            )  # The nearer wins ties.
+            rank = first.sort(dim=-1, descending=True, stable=True).indices.argsort(dim=-1)  # The nearer wins ties.
             return torch.where(rank < most, first, torch.zeros_like(first))
 
         def table(slots: Tensor, count: int) -> Tensor:

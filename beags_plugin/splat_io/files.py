@@ -10,6 +10,12 @@ from beags_plugin.system.errors import writing
 from beags_plugin.system.whole_files import put_in_place, unfinished
 
 
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file as ``whole_file`` does."""
+    with whole_file(path) as part:
+        part.write_bytes(content)
+
+
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
     """Yield a path beside ``path`` to write to, then move the written file into place; makes the folder.

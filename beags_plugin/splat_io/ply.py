@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Literal
 
@@ -58,12 +59,16 @@ def write_ply(
         write_vertices(file, table, DISC_COMMENT if layout == "2dgs" else "")
 
 
+def thin_log_scales(log_scales: Tensor) -> Tensor:
+    """Return log scales [N, 2] as those of 3D Gaussians, [N, 3]: the third is ``THICKNESS`` times the smaller one."""
+    return torch.cat([log_scales, log_scales.amin(dim=-1, keepdim=True) + math.log(THICKNESS)], dim=-1)
+
+
 def _columns(surfels: Surfels, layout: str) -> dict[str, np.ndarray]:
     quats = torch.nn.functional.normalize(surfels.quats.detach(), dim=-1)
     normals = rotation_from_quat(quats)[:, :, 2]
     log_scales = surfels.log_scales.detach()
-    thin = log_scales.amin(dim=-1, keepdim=True) + float(np.log(THICKNESS))
-    scales = torch.cat([log_scales, thin], dim=-1) if layout == "3dgs" else log_scales
+    scales = thin_log_scales(log_scales) if layout == "3dgs" else log_scales
     rest = surfels.sh_rest.detach()
     if layout == "2dgs":
         rest = torch.cat([rest, rest.new_zeros(len(rest), num_sh_bases(MAX_DEGREE) - 1 - rest.shape[1], 3)], dim=1)

@@ -70,7 +70,7 @@ def item(thing) -> ExportItem:
 
 @pytest.fixture(scope="module")
 def mesh(item) -> Mesh:
-    return GlbExporter(**OPTIONS).mesh(item)
+    return GlbExporter(**OPTIONS).made(item).mesh
 
 
 def test_vertices_lie_on_the_exact_surface(thing, mesh):
@@ -146,7 +146,7 @@ def test_a_view_of_a_few_pixels_adds_nothing(item, mesh, monkeypatch):
 
 def test_both_file_types_share_one_mesh(item):
     glb, obj = (make_exporter(name, **OPTIONS) for name in ("glb", "obj"))
-    assert glb.mesh(item) is obj.mesh(item)
+    assert glb.made(item) is obj.made(item)
 
 
 @pytest.mark.slow("fuses a voxel grid of hundreds of MB")
