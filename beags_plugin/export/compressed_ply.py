@@ -49,9 +49,7 @@ def compressed_ply(values: SplatValues) -> bytes:
         places = (block - low[of]) / np.where(extent > 0, extent, 1.0)[of]
         columns += [low, high]
         words[name] = _packed(places, (11, 10, 11)) if name != "color" else _packed(places, (8, 8, 8)) << np.uint32(8)
-    words["color"] |= (
-        np.rint(255.0 * values.opacities).clip(1, 254).astype(np.uint32)
-    )  # 0 and 255: infinite logits
+    words["color"] |= np.rint(255.0 * values.opacities).clip(1, 254).astype(np.uint32)  # 0 and 255: infinite logits
     largest, others = smallest_three(values.quats)
     words["rotation"] = largest.astype(np.uint32) << np.uint32(30) | _packed(others / 2 + 0.5, (10, 10, 10))
     vertices = np.stack([words[name] for name in ("position", "rotation", "scale", "color")], axis=1)

@@ -57,9 +57,7 @@ class SplatExporter(Exporter):
         rows = np.empty(len(values), _ROW)
         rows["mean"], rows["scale"] = values.means[order], np.exp(values.log_scales[order])
         colors = np.column_stack([0.5 + SH_C0 * values.sh_dc, values.opacities])[order]
-        rows["color"] = np.rint(255.0 * colors).clip(
-            [0, 0, 0, 1], [255, 255, 255, 254]
-        )  # 255: an infinite logit
+        rows["color"] = np.rint(255.0 * colors).clip([0, 0, 0, 1], [255, 255, 255, 254])  # 255: an infinite logit
         rows["quat"] = np.rint(128.0 * values.quats[order] + 128.0).clip(0, 255)
         write_bytes(path, rows.tobytes())
         return {}

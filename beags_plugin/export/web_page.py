@@ -153,9 +153,7 @@ def _viewer() -> tuple[str, str]:
     if "/assets/" in script or script.count(_START) != 1 or _SKY not in script:
         raise UserError(f"the viewer of viser {version('viser')} does not fit into one page")
     script = script.replace(_START, f'{_START}??"{_SCENE}"').replace("</script", r"<\/script")
-    style = re.sub(
-        r"@font-face\s*{[^}]*}", "", styles[0].read_text("utf8")
-    )  # Fonts are files.
+    style = re.sub(r"@font-face\s*{[^}]*}", "", styles[0].read_text("utf8"))  # Fonts are files.
     return script, style
 
 

@@ -66,9 +66,7 @@ def unwrapped(mesh: Mesh, size: int, density: float = 0.0) -> Atlas:
     pack.resolution, pack.texels_per_unit = (0, density * mesh.voxel) if density else (size, 0.0)
     atlas.generate(xatlas.ChartOptions(), pack)
     source, faces, uv = atlas[0]
-    side = max(
-        atlas.width, atlas.height, 1
-    )  # xatlas may exceed the size slightly, or return 0 without area.
+    side = max(atlas.width, atlas.height, 1)  # xatlas may exceed the size slightly, or return 0 without area.
     if density:
         whole = max(SMALLEST, 2 ** math.ceil(math.log2(_LEAST * side)))
         if whole > size:
