@@ -49,11 +49,11 @@ class MeshExporter(MeshOptions, Exporter):
 
     def _made(self, item: ExportItem, closing: bool) -> MadeMesh:
         most = self.triangles or min(MOST, max(FEWEST, PER_GAUSSIAN * len(item.surfels)))
-        surface = placed_surface(item, self)
+        surface, pixels = placed_surface(item, self)
         if closing:
-            solid = closed_mesh(item, surface.mesh, self.smallest_part, most)
-            return MadeMesh(solid.mesh, surface.pixels, solid.invented)
-        return MadeMesh(decimated(surface.mesh, most), surface.pixels)
+            solid = closed_mesh(item, surface, self.smallest_part, most)
+            return MadeMesh(solid.mesh, pixels, solid.invented)
+        return MadeMesh(decimated(surface, most), pixels)
 
 
 @dataclass(frozen=True)

@@ -200,7 +200,7 @@ def _collider(item: ExportItem, options: MeshOptions) -> tuple[Closed | None, st
         return None, ""
     own = without_invented(item)
     try:
-        return closed_mesh(own, placed_surface(own, options).mesh, options.smallest_part, MOST), ""
+        return closed_mesh(own, placed_surface(own, options)[0], options.smallest_part, MOST), ""
     except NothingToExport as error:
         return None, f"none, as {str(error).partition(':')[0]}"
 

@@ -31,11 +31,10 @@ from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.runs.run import Run
 from beags_plugin.splat_io.far_worlds import far_world_note, local_origin, unlist, write_origin
 from beags_plugin.splat_io.files import whole_file
-from beags_plugin.surfaces.frames import check_placement
 from beags_plugin.surfaces.item import ExportItem
 from beags_plugin.surfaces.mesh_options import MeshOptions
 from beags_plugin.surfaces.meshing import open3d_missing
-from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.errors import UserError, check_choice, writing
 from beags_plugin.system.reading.text import load_json
 from beags_plugin.system.whole_files import remove_unfinished
 
@@ -74,7 +73,7 @@ def export_run(
     without Gaussians, if everything is asked for. Raises ``UserError`` for a mistake, before anything is written.
     """
     run, folder, pose = Run(config_path, data), output or config_path.parent / "exports", pose or PoseOptions()
-    check_placement(placement)
+    check_choice(placement, ("world", "object"), "frame")
     if pose.centre and placement == "object":
         raise UserError("--centre puts the origin under objects, --frame object into their middle: leave one out.")
     exporters = {name: make_exporter(name, **(options or {}).get(name, {})) for name in formats}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -21,22 +20,26 @@ class VoxelVotes:
     2^20 - 8 voxels or more from 0 along an axis, neither vote nor get an answer. ``masks.voxel_reprojection`` describes
     how votes are read. Memory is linear in the voxels; the number of classes costs neither time nor memory.
 
-    ignore: the label that does not vote.
+    ignore: the label that does not vote. tally: memory on a GPU, where all tensors but ``to_voxels`` then lie, or None for
+        the CPU. The results are the same.
     """
 
-    def __init__(self, ignore: int) -> None:
-        self._native: Any = extension.module().VoxelVotes(extension.threads())
-        self._ignore = ignore
+    def __init__(self, ignore: int, tally: VoxelTally | None = None) -> None:
+        self._ignore, self._tally = ignore, tally
+        self._native: Any = extension.module().VoxelVotes(extension.threads()) if tally is None else None
 
     def add(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> None:
         """Add one vote of each pixel. depth: [H, W] float32 or float64; labels: [H, W] int32, 0 or more."""
         depth, to_voxels = _view(depth, to_voxels)
         labels = extension.plain("labels", labels, tuple(depth.shape), torch.int32)
-        extension.function("add", depth, self._native)(depth, to_voxels, labels, self._ignore)
+        if self._tally is not None:
+            self._tally.add_pixels(depth, to_voxels.cpu(), labels, self._ignore)
+        else:
+            extension.function("add", depth, self._native)(depth, to_voxels, labels, self._ignore)
 
     def decide(self) -> None:
         """Decide each voxel; call it after all votes and before ``read``."""
-        self._native.decide()
+        (self._tally or self._native).decide()
 
     def read(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
         """Return the class that leads around each pixel's point, and its share of the votes.
@@ -49,32 +52,11 @@ class VoxelVotes:
         """
         depth, to_voxels = _view(depth, to_voxels)
         labels = extension.plain("labels", labels, tuple(depth.shape), torch.int32).clone()
+        if self._tally is not None:
+            return labels, self._tally.read(depth, to_voxels.cpu(), labels)
         confidence = torch.empty(tuple(depth.shape), dtype=torch.float32)
         extension.function("read", depth, self._native)(depth, to_voxels, labels, confidence)
         return labels, confidence
-
-
-class CudaVoxelVotes:
-    """``VoxelVotes`` on a GPU, with the same results; all tensors but ``to_voxels`` lie on the GPU."""
-
-    def __init__(self, ignore: int, module: ModuleType, device: torch.device) -> None:
-        self._tally, self._ignore = VoxelTally(module, device), ignore
-
-    def add(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> None:
-        """See ``VoxelVotes.add``."""
-        depth, to_voxels = _view(depth, to_voxels)
-        labels = extension.plain("labels", labels, tuple(depth.shape), torch.int32)
-        self._tally.add_pixels(depth, to_voxels.cpu(), labels, self._ignore)
-
-    def decide(self) -> None:
-        """See ``VoxelVotes.decide``."""
-        self._tally.decide()
-
-    def read(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """See ``VoxelVotes.read``."""
-        depth, to_voxels = _view(depth, to_voxels)
-        labels = extension.plain("labels", labels, tuple(depth.shape), torch.int32).clone()
-        return labels, self._tally.read(depth, to_voxels.cpu(), labels)
 
 
 def brick_sample(depth: Tensor, to_voxels: Tensor, part: int) -> Tensor:
@@ -86,10 +68,10 @@ def brick_sample(depth: Tensor, to_voxels: Tensor, part: int) -> Tensor:
     return torch.tensor(bricks, dtype=torch.int64).reshape(-1, 3)
 
 
-def votes_for(depths: Sequence[Tensor], ignore: int) -> VoxelVotes | CudaVoxelVotes | None:
+def votes_for(depths: Sequence[Tensor], ignore: int) -> VoxelVotes | None:
     """Return the compiled counter of votes for depths on this device; None if there is none."""
     if (module := cuda_extension.module_for(*depths)) is not None:
-        return CudaVoxelVotes(ignore, module, depths[0].device)
+        return VoxelVotes(ignore, VoxelTally(module, depths[0].device))
     return VoxelVotes(ignore) if extension.supports(*depths) else None
 
 

@@ -30,7 +30,7 @@ from beags_plugin.rasterizers.autograd import (
 )
 from beags_plugin.rasterizers.interface import FLOATS, RasterSettings, SurfelInputs, map_ids
 from beags_plugin.rasterizers.optional import OptionalProducts
-from beags_plugin.rasterizers.pair_counts import PairCounts, capacity_for
+from beags_plugin.rasterizers.pair_counts import PairCounts, capacity_for, start_copy
 from beags_plugin.rasterizers.rendering import class_channels_by_threes
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 from beags_plugin.system.errors import UserError
@@ -225,21 +225,21 @@ class CudaRasterizer(KernelRasterizer, OptionalProducts):
             frame, totals = self._project(module, inputs, camera, settings)
             capturing = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
             counts, place = self._counts, self._counts.place(device)
-            sent = None if capturing else counts.send(totals)
+            wait = None if capturing else start_copy(totals)  # The numbers of pairs and of surfels that are not finite.
             guess = counts.guess(place)
             if guess is None:
-                if sent is None:
+                if wait is None:
                     raise UserError("render the scene once before it is captured into a CUDA graph.")
-                first, _ = counts.receive(sent)
+                first, _ = wait()
                 counts.learn(place, first)
                 guess = float(first)
             capacity = self._bin(frame, camera, guess, n)
             render(frame)
-            if sent is None:
+            if wait is None:
                 self._captured.append((totals, capacity))
                 frame.num_nonfinite = UNKNOWN
             else:
-                pairs, frame.num_nonfinite = counts.receive(sent)
+                pairs, frame.num_nonfinite = wait()
                 counts.learn(place, pairs)
                 if pairs > capacity:
                     self._bin(frame, camera, float(pairs), n)

@@ -5,9 +5,8 @@ The GPU counts them. The host guesses the number from earlier renders, to alloca
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from threading import get_ident
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,14 +16,6 @@ _SPARE = 1.25  # factor from the expected pairs to the allocated ones
 _STEP = 1 << 14  # pairs, or an eighth of the power of two below: few distinct sizes do not fragment torch's allocator
 
 Place = tuple[torch.device, int]  # a GPU and a thread, so that a viewer's renders do not affect a training
-
-
-@dataclass
-class Sent:
-    """A render's numbers of pairs and of surfels that are not finite, on their way to the host."""
-
-    numbers: Tensor
-    event: Any
 
 
 class PairCounts:
@@ -50,22 +41,21 @@ class PairCounts:
         """Note the number of pairs that a render had."""
         self._largest[place] = max(self._largest.get(place, 0.0) * _FADING, float(pairs))
 
-    def send(self, totals: Tensor) -> Sent:
-        """Start to copy the two numbers of a render to the host."""
-        if not totals.is_cuda:
-            return Sent(totals, None)
-        numbers = torch.empty(2, dtype=torch.int64, pin_memory=True)  # torch reuses pinned memory.
-        numbers.copy_(totals, non_blocking=True)
-        event = torch.cuda.Event()
-        event.record()
-        return Sent(numbers, event)
 
-    def receive(self, sent: Sent) -> tuple[int, int]:
-        """Wait for the numbers of pairs and of surfels that are not finite."""
-        if sent.event is not None:
-            sent.event.synchronize()
-        pairs, nonfinite = sent.numbers.tolist()
-        return pairs, nonfinite
+def start_copy(totals: Tensor) -> Callable[[], list[int]]:
+    """Start to copy ``totals`` [2] to the host; return a function that waits for the two numbers."""
+    if not totals.is_cuda:
+        return totals.tolist
+    numbers = torch.empty(2, dtype=torch.int64, pin_memory=True)  # torch reuses pinned memory.
+    numbers.copy_(totals, non_blocking=True)
+    event = torch.cuda.Event()
+    event.record()
+
+    def wait() -> list[int]:
+        event.synchronize()
+        return numbers.tolist()
+
+    return wait
 
 
 def capacity_for(pairs: float) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -14,9 +13,7 @@ from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.splat_io.frames import to_input_frame
 from beags_plugin.surfaces.item import Viewpoints
-from beags_plugin.system.errors import check_choice
 
-Placement = Literal["world", "object"]
 _BULK = 0.01  # share of the surfels at each side that the size of the item leaves out, because some are strays
 _FENCE = 0.5  # distance beyond the bulk, over its longest side, within which thin parts still count
 
@@ -81,11 +78,6 @@ class Frame:
         matrix = torch.eye(4, dtype=torch.float64)
         matrix[:3] = self.scale * self.transform.double()
         return matrix.tolist()
-
-
-def check_placement(placement: str) -> None:
-    """Raise ``UserError`` unless ``placement`` is one of ``Placement``."""
-    check_choice(placement, get_args(Placement), "frame")
 
 
 def bounding_box(surfels: Surfels) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ from beags_plugin.surfaces.fusion import Mesh, decimated, fuse, suitable_resolut
 from beags_plugin.surfaces.item import ExportItem, NothingToExport
 from beags_plugin.surfaces.mesh_options import MeshOptions
 from beags_plugin.surfaces.surface import area_vectors
-from beags_plugin.surfaces.surface_alignment import Placed, placed
+from beags_plugin.surfaces.surface_alignment import placed
 from beags_plugin.system.open3d_kernels import open3d_kernels
 from beags_plugin.system.progress import progress_bar
 
@@ -29,10 +29,10 @@ def seen_surface(item: ExportItem, options: MeshOptions) -> Mesh:
     return without_small_parts(fused, options.smallest_part)
 
 
-def placed_surface(item: ExportItem, options: MeshOptions) -> Placed:
-    """Return the surface that the views see, aligned with the photos, if any; raises ``NothingToExport`` without faces.
+def placed_surface(item: ExportItem, options: MeshOptions) -> tuple[Mesh, float]:
+    """Return the surface that the views see, aligned with the photos, if any, and the mean move in pixels.
 
-    It is made once for each set of options.
+    It is made once for each set of options. Raises ``NothingToExport`` for a surface without faces.
     """
     mesh = seen_surface(item, options)
     if not len(mesh.faces):
@@ -41,7 +41,7 @@ def placed_surface(item: ExportItem, options: MeshOptions) -> Placed:
             "lower --min-views, or export it as splats."
         )
     if not item.photos:
-        return Placed(mesh, 0.0)
+        return mesh, 0.0
     chosen = options.resolution, options.truncation, options.memory_mb, options.min_views, options.smallest_part
     aligned = item.shared.get(("placed", chosen))
     if aligned is None:

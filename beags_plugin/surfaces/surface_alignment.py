@@ -9,7 +9,7 @@ as mirror images do. A surface is therefore only moved if its outline still fits
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,25 +35,17 @@ _PIXELS = 50_000  # approximate number of pixels of a photo at which outlines ar
 _NOISE = 1e-5  # disagreement per squared pixel, which keeps places of one colour where they are
 
 
-@dataclass(frozen=True)
-class Placed:
-    """A mesh, and the mean number of pixels by which its places were moved."""
-
-    mesh: Mesh
-    pixels: float
-
-
 def placed(
     mesh: Mesh, photos: Sequence[Photo], progress: Callable[[int, int], None] = lambda done, total: None
-) -> Placed:
-    """Return a mesh of at least one face, moved to where photos agree; unchanged where too few photos see it.
+) -> tuple[Mesh, float]:
+    """Return a mesh of at least one face, moved to where photos agree, and the mean move in pixels.
 
-    A round that moves its outline away from the photos' masks is dropped. progress: receives (done, total) photos, each
-    of which is read once, and then three times in a round.
+    The mesh is unchanged if too few photos see it. A round that moves its outline away from the photos' masks is
+    dropped. progress: receives (done, total) photos, each of which is read once, and then three times in a round.
     """
     count = len(photos)
     if count < _FEWEST:
-        return Placed(mesh, 0.0)
+        return mesh, 0.0
     moved, total = 0.0, (1 + 3 * _ROUNDS) * count
 
     def passed(before: int) -> Callable[[int], None]:
@@ -67,7 +59,7 @@ def placed(
             break
         mesh, pixels = result
         moved += pixels
-    return Placed(mesh, moved)
+    return mesh, moved
 
 
 def outline_iou(mesh: Mesh, photos: Sequence[Photo], progress: Callable[[int], None] = lambda done: None) -> float:
