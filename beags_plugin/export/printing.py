@@ -15,7 +15,7 @@ from beags_plugin.export.mesh import MeshExporter
 from beags_plugin.splat_io.files import write_bytes
 from beags_plugin.surfaces.item import ExportItem
 
-MILLIMETRES = 1000.0  # per metre
+MILLIMETRES = 1000.0  # millimetres per metre
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ VERSIONS = (3, 4)
 _HEADER = 32  # bytes of the header of version 4
 _EFFORT = 12  # zstd's level, of 22; higher ones take much longer for one percent
 _MOST = 2**23 - 1  # a signed 24-bit number
-_COLOR_SCALE = 0.15  # from the format: bytes hold 0.5 + 0.15 dc, so that colours slightly out of range survive
+_COLOR_SCALE = 0.15  # the format's factor: bytes hold 0.5 + 0.15 dc, so that colours slightly out of range survive
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ RADIUS = 3.0  # the disc's radius, in units of the scales (method, section 6)
 
 _WORD = (1 << 64) - 1
 _GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / golden ratio: counters times it are spread over all bits
-_MULTIPLIERS = (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)  # from SplitMix64, as are the shifts 30, 27, 31
+_MULTIPLIERS = (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)  # multipliers of SplitMix64, as are the shifts 30, 27, 31
 
 
 def _mix(word: int) -> int:

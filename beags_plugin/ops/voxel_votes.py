@@ -20,8 +20,8 @@ class VoxelVotes:
     2^20 - 8 voxels or more from 0 along an axis, neither vote nor get an answer. ``masks.voxel_reprojection`` describes
     how votes are read. Memory is linear in the voxels; the number of classes costs neither time nor memory.
 
-    ignore: the label that does not vote. tally: memory on a GPU, where all tensors but ``to_voxels`` then lie, or None for
-        the CPU. The results are the same.
+    ignore: the label that does not vote. tally: memory on a GPU that then holds all tensors but ``to_voxels``, or None
+        for the CPU. The results are the same.
     """
 
     def __init__(self, ignore: int, tally: VoxelTally | None = None) -> None:

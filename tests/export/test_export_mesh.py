@@ -76,7 +76,7 @@ def mesh(item) -> Mesh:
 def test_vertices_lie_on_the_exact_surface(thing, mesh):
     assert mesh.voxel == pytest.approx(2 * 0.18 / 96, rel=0.15)
     off = np.abs(distance(thing, mesh.vertices))
-    # not all: at sharp edges discs stick out
+    # Some vertices lie outside: discs stick out at sharp edges.
     assert np.quantile(off, 0.9) < mesh.voxel and off.max() < 4 * mesh.voxel
     assert np.median(off) < 0.5 * mesh.voxel
 
@@ -183,7 +183,7 @@ def test_the_scale_of_a_scene_changes_nothing(item, mesh, scale):
     views = Viewpoints([scaled(camera) for camera in views.cameras], views.rasterizer, settings)
     other = GlbExporter(**OPTIONS).mesh(replace(item, surfels=large, views=views, shared={}))
     assert other.voxel == pytest.approx(scale * mesh.voxel, rel=1e-5)
-    # not bit by bit: a pixel's depth may fall to the neighbouring disc
+    # The bits differ: a pixel's depth may be that of the neighbouring disc.
     distance, _ = cKDTree(mesh.vertices).query(other.vertices / scale)
     assert np.quantile(distance, 0.99) < 0.1 * mesh.voxel
 

@@ -72,7 +72,7 @@ def test_count_and_valid_equal_sets():
 def test_colliding_classes_leave_a_voxel_empty():
     points = torch.tensor([[0.5, 0.5, 0.5], [0.6, 0.6, 0.6], [5.5, 0.5, 0.5], [5.6, 0.5, 0.5]])
     ids = torch.tensor([1, 2, 1, 1], dtype=torch.int32)
-    clouds = [(points[:1], ids[:1]), (points[1:], ids[1:])]  # in two views
+    clouds = [(points[:1], ids[:1]), (points[1:], ids[1:])]  # two views
     grid = VisibilityGrid.from_points(clouds, 1.0, torch.zeros(3), 3)
     assert len(grid.keys) == 1 and grid.classes.tolist() == [1]
     assert grid.count(points, ids).tolist() == [0, 0, 1, 1]
@@ -215,9 +215,8 @@ def test_build_lifts_solid_pixels_of_all_views(kind):
     depths = [view.median_depth if kind == "median" else view.depth for view in views]
     points = torch.cat([lift(d, v)[s] for d, v, s in zip(depths, views, solid, strict=True)])
     ids = torch.cat([v.classes[s] for v, s in zip(views, solid, strict=True)])
-    assert grid.voxel_size == pytest.approx(
-        voxel_size_of_reference(points.numpy(), len(points), k=3)
-    )  # of all classes together
+    together = voxel_size_of_reference(points.numpy(), len(points), k=3)  # the size for all classes together
+    assert grid.voxel_size == pytest.approx(together)
     expected = VisibilityGrid.from_points([(points, ids)], grid.voxel_size, grid.origin, CLASSES)
     assert len(expected.keys) > 10
     assert torch.equal(grid.keys, expected.keys) and torch.equal(grid.classes, expected.classes)

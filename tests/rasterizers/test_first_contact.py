@@ -169,7 +169,7 @@ def test_auto_does_without_one_that_fails_and_says_so_once(monkeypatch, capfd, b
         rasterizer = make_rasterizer("auto")
         assert isinstance(rasterizer, DeviceDispatchRasterizer)
         assert isinstance(rasterizer.cpu, NativeRasterizer) and isinstance(rasterizer.gpu, TorchRasterizer)
-    module, reason = cuda_extension.status()  # and so no op computes there either
+    module, reason = cuda_extension.status()  # No op computes on the GPU either.
     assert module is None and cuda_extension.load() is None
     assert reason is not None and why in reason and "the CPU is used instead of NVIDIA X" in reason
     lines = capfd.readouterr().err.splitlines()
