@@ -67,8 +67,8 @@ def disc_sums(
 
 
 def violation_shares(
-    surfels: Surfels, class_ids: Tensor, grid: VisibilityGrid, samples: int = 20, background: bool = True, seed: int = 0
+    surfels: Surfels, class_ids: Tensor, grid: VisibilityGrid, samples: int = 20, background: bool = True
 ) -> Tensor:
     """Return ``wrong`` / ``whole`` of ``disc_sums``, [N] float in 0..1."""
-    sums = disc_sums(surfels, class_ids, grid, samples, background, seed)
+    sums = disc_sums(surfels, class_ids, grid, samples, background)
     return (sums.wrong / sums.whole.clamp_min(torch.finfo(torch.float64).tiny)).to(surfels.means.dtype)

@@ -72,8 +72,8 @@ def _standing(thing: Thing[Mesh]) -> Group:
 class DeskLight(RoomLight):
     """The light of a room, measured once on a grid over all surfaces, so that many photos need no further rays."""
 
-    def __init__(self, room: Room, lamp_samples: int = 24, bounce_samples: int = 16) -> None:
-        super().__init__(room, lamp_samples, bounce_samples)
+    def __init__(self, room: Room) -> None:
+        super().__init__(room)
         self._maps: dict[int, LightMap] = {}
         self._lock = Lock()
         parts = [*range(1, len(room.things) + 1), *(-1 - i for i in range(len(room.fixtures))), SHELL]

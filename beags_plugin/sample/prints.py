@@ -108,8 +108,9 @@ def poster(noise: Noise, colours: np.ndarray, wide: float, high: float) -> Print
     return paint
 
 
-def spines(noise: Noise, colours: np.ndarray, shelf: float = 0.52) -> Print:
+def spines(noise: Noise, colours: np.ndarray) -> Print:
     """Return shelves of books: upright spines of random width, height and colour, with titles; colours [K, 3]."""
+    shelf = 0.52
 
     def paint(u: np.ndarray, v: np.ndarray) -> np.ndarray:
         row = np.floor(v / shelf)
