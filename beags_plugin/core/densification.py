@@ -185,12 +185,12 @@ def split_by_sampling(surfels: Surfels, chosen: Tensor, generator: torch.Generat
 
 def _grow(surfels: Surfels, cloned: Tensor, split: Tensor, generator: torch.Generator) -> Densified:
     """Add copies of the ``cloned`` [N] bool, then replace each ``split`` [N] bool by two; see ``split_by_sampling``."""
-    kept, clones, splits = (which.nonzero()[:, 0] for which in (~split, cloned, split))
-    source = torch.cat([kept, clones, splits, splits])
+    rest, clones, splits = (which.nonzero()[:, 0] for which in (~split, cloned, split))
+    source = torch.cat([rest, clones, splits, splits])
     fresh = torch.zeros_like(source, dtype=torch.bool)
-    fresh[kept.shape[0] :] = True
+    fresh[rest.shape[0] :] = True
     grown = surfels[source]
-    halves = slice(kept.shape[0] + clones.shape[0], None)
+    halves = slice(rest.shape[0] + clones.shape[0], None)
     grown.means[halves] += _offsets(grown[halves], generator)
     grown.log_scales[halves] -= math.log(SPLIT_SHRINK)
     return Densified(grown, source, fresh)

@@ -92,8 +92,8 @@ def _each_axis(bricks: _Bricks, change: Any) -> _Bricks:
     """Apply ``change(bricks, axis)`` along one axis after the other; drop the bricks that become empty."""
     for axis in range(3):
         numbers, bits = change(bricks, axis)
-        kept = bits != 0
-        bricks = _Bricks(numbers[kept], bits[kept], bricks.classes, bricks.base, bricks.size)
+        nonempty = bits != 0
+        bricks = _Bricks(numbers[nonempty], bits[nonempty], bricks.classes, bricks.base, bricks.size)
     return bricks
 
 
