@@ -59,7 +59,7 @@ def members(
         unlabelled[places[label == IGNORE]] += 1
         keys = (places * num_classes + label)[(label != IGNORE) & (label != BACKGROUND)]
         sums.add(keys, torch.ones_like(keys, dtype=torch.float64))
-    keys, counts = sums.found()
+    keys, counts = sums.totals()
     rows = keys // num_classes
     if votes == "all":
         voters = len(views) - unlabelled.double()[rows]

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding
 
 from beags_baselines.object_entropy import label_entropy
-from beags_plugin.core.densification import SH_C0
+from beags_plugin.core.sh import SH_C0
 from beags_plugin.losses.reduction import ordered_linear, ordered_mean
 
 CHANNELS = 16

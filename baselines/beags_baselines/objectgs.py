@@ -147,4 +147,4 @@ def labels_by_majority(
         label = mask[row, column].long()
         keys = (seen * num_classes + label)[label != IGNORE]
         votes.add(keys, torch.ones_like(keys, dtype=torch.float64))
-    return labels_by_weight(*votes.found(), len(points), num_classes)
+    return labels_by_weight(*votes.totals(), len(points), num_classes)

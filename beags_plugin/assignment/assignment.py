@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from beags_plugin.assignment.contributions import Contributions, contributions
-from beags_plugin.core.cameras import Camera
-from beags_plugin.core.surfels import Surfels
-from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
+from beags_plugin.assignment.contributions import Contributions
 
 
 @dataclass(frozen=True)
@@ -32,22 +28,9 @@ class Assignment:
         return Assignment(self.class_ids[selection], self.margin[selection], self.never_seen[selection])
 
 
-def assign_classes(
-    surfels: Surfels,
-    cameras: Sequence[Camera],
-    labels: Sequence[Tensor | None],
-    rasterizer: Rasterizer,
-    settings: RasterSettings,
-    num_classes: int,
-    progress: Callable[[int, int], None] | None = None,
-) -> Assignment:
-    """Return phi_i = argmax_c C[i, c] (E6), ties to lower ids; arguments as of ``contributions``."""
-    return by_largest(contributions(surfels, cameras, labels, rasterizer, settings, num_classes, progress))
-
-
-def by_largest(found: Contributions) -> Assignment:
+def by_largest(sums: Contributions) -> Assignment:
     """Return phi_i = argmax_c C[i, c] (E6), ties to lower ids."""
-    class_ids, top, everything = found.largest()
-    never_seen = everything <= 0
-    margin = torch.where(never_seen, 0.0, top / everything.masked_fill(never_seen, 1.0))
+    class_ids, top, total = sums.largest()
+    never_seen = total <= 0
+    margin = torch.where(never_seen, 0.0, top / total.masked_fill(never_seen, 1.0))
     return Assignment(class_ids, margin.float(), never_seen)

@@ -39,7 +39,7 @@ class Contributions:
     def largest(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return per Gaussian the class of the largest sum (the lowest of equals), that sum, and the total.
 
-        [N] int32 class ids, twice [N] float64; 0 for a Gaussian that was never seen.
+        Returns [N] int32 class ids and twice [N] float64; 0 for a Gaussian that was never seen.
         """
         ranks, top, everything = largest_in_rows(self.keys, self.sums, self.count, self.columns)
         return ranks.int() if self.classes is None else self.classes.class_ids(ranks), top, everything
@@ -50,9 +50,9 @@ class Contributions:
         if self.classes is not None:
             rank = int(self.classes.ranks(torch.tensor([class_id])))
         own = self.keys % self.columns == rank
-        found = self.sums.new_zeros(self.count)
-        found[self.keys[own] // self.columns] = self.sums[own]
-        return found
+        sums = self.sums.new_zeros(self.count)
+        sums[self.keys[own] // self.columns] = self.sums[own]
+        return sums
 
     def total(self) -> Tensor:
         """Return [N] float64, the sums over all classes."""
@@ -77,7 +77,7 @@ def contributions(
     """
     settings = replace(settings, geometry=False, distortion=False)
     inputs = geometry_inputs(surfels)
-    # float64, for thousands of small weights; sparse, as a table of all classes would be mostly zeros
+    # Thousands of small weights need float64; a dense table of all classes would be mostly zeros.
     product = product or rasterizer.sparse_class_contributions
     total = SparseSums() if extension.supports(surfels.means) else TorchSparseSums(surfels.means.device)
 
@@ -94,7 +94,7 @@ def contributions(
         raise ValueError(f"{len(cameras)} cameras and {len(labels)} masks do not belong together")
     for keys, values in each_view(len(cameras), of_view, progress):
         total.add(keys, values)
-    return Contributions(len(surfels), num_classes, *total.found())
+    return Contributions(len(surfels), num_classes, *total.totals())
 
 
 def check_class_ids(mask: Tensor, index: int, num_classes: int) -> None:

@@ -20,7 +20,7 @@ class TorchSparseSums:
             known = self._keys[at.clamp(max=len(self._keys) - 1)] == keys
             self._sums[at[known]] += values[known].double()
         fresh, values, place = keys[~known], values[~known].double(), at[~known]
-        place = place + torch.arange(len(place), device=place.device)  # among all keys
+        place = place + torch.arange(len(place), device=place.device)  # index among all keys
         former = torch.ones(len(self._keys) + len(fresh), dtype=torch.bool, device=place.device)
         former[place] = False
         merged_keys, merged_sums = fresh.new_empty(len(former)), values.new_empty(len(former))
@@ -28,7 +28,7 @@ class TorchSparseSums:
         merged_sums[former], merged_sums[place] = self._sums, values
         self._keys, self._sums = merged_keys, merged_sums
 
-    def found(self) -> tuple[Tensor, Tensor]:
+    def totals(self) -> tuple[Tensor, Tensor]:
         return self._keys, self._sums
 
 
@@ -44,5 +44,5 @@ def largest_in_rows(keys: Tensor, sums: Tensor, rows: int, columns: int) -> tupl
     leads = sums == top[row]
     first = torch.full((rows,), columns, dtype=torch.int64, device=keys.device)
     first = first.scatter_reduce(0, row[leads], column[leads], "amin")
-    # one after the other, in the order of the columns
+    # Determinism: keys ascend, so each row's total adds its columns in order.
     return first.masked_fill(first == columns, 0), top, zeros.index_add(0, row, sums)

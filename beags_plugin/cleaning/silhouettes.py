@@ -1,4 +1,4 @@
-"""What the masks of training views say about the Gaussians of an object that is drawn alone."""
+"""Weights of an object's Gaussians inside and outside the masks of training views, with the object rendered alone."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class MaskedViews:
     """Training views of a whole scene, in its frame.
 
     cameras: without lens distortion. labels: per view [H, W] int32, the class ids or IGNORE after reprojection.
-    depths: per view [H, W], the median depth of the whole scene, 0 where nothing is.
+    depths: per view [H, W], the median depth of the whole scene, 0 where it is empty.
     """
 
     cameras: Sequence[Camera]
@@ -36,9 +36,9 @@ class MaskedViews:
     def evidence(self, part: Surfels, class_id: int) -> np.ndarray:
         """Return [M, 4] float64, weights of an object's Gaussians inside its masks, outside, hidden, and beside them.
 
-        They are sums of w_i over the pixels of all views, the object drawn alone. Outside are pixels of other classes
-        (the background too) that are not next to the object's mask, where the whole scene shows nothing nearer than the
-        object; hidden are those where it does; beside are those next to the mask. Unlabelled pixels do not count.
+        They are sums of w_i over the pixels of all views, the object rendered alone. Beside are pixels of other classes
+        (the background too) next to the object's mask. Of the other pixels, hidden are those where the whole scene
+        shows something nearer than the object, and outside the rest. Unlabelled pixels do not count.
         """
         total = np.zeros((len(part), 4))
         for view, places, _ in self._places(part, class_id):
@@ -48,7 +48,7 @@ class MaskedViews:
     def flips(self, part: Surfels, rest: Surfels, class_id: int) -> np.ndarray:
         """Return [M, 2] float64, the weights of an object's Gaussians at pixels that ``rest`` alone no longer covers.
 
-        First those inside its masks (holes), then those outside, as ``evidence`` counts them. A pixel is covered where
+        The first column is inside its masks (holes), the second outside, as in ``evidence``. A pixel is covered where
         alpha exceeds 1/2. part: M Gaussians. rest: some of them.
         """
         total = np.zeros((len(part), 4))
@@ -80,10 +80,10 @@ class MaskedViews:
         """Return [M, 4] float64, the sums of w_i by place in one view."""
         settings = replace(self.settings, geometry=False, distortion=False)
         with torch.no_grad():
-            found = self.rasterizer.class_contributions(
+            sums = self.rasterizer.class_contributions(
                 geometry_inputs(part), self.cameras[view], settings, places.int(), 4
             )
-        return found.double().cpu().numpy()
+        return sums.double().cpu().numpy()
 
 
 def _black(surfels: Surfels) -> Tensor:

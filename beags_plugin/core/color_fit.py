@@ -15,11 +15,11 @@ def affine_color_fit(rendered: Tensor, photo: Tensor, where: Tensor | None = Non
     """Return the affine colour map that minimises the squared error of the mapped rendering against the photo.
 
     rendered, photo: [..., 3] float, values as scored or trained on. where: [...] bool, the pixels to fit, or None for
-    all; pixels with a value that is not finite never count. Returns [3, 4] float64, the matrix and behind it the
+    all; pixels with a value that is not finite never count. Returns [3, 4] float64, the matrix followed by the
     offset. Where several maps fit alike, as for a rendering of one colour, it is the one whose matrix is nearest to the
     identity; without any pixel it is the identity.
 
-    Source: linear least squares in closed form, on colours less their mean.
+    Source: linear least squares in closed form, on centred colours.
     """
     x, y = rendered.reshape(-1, 3).double(), photo.reshape(-1, 3).double()
     counted = (torch.isfinite(x) & torch.isfinite(y)).all(dim=-1)

@@ -9,21 +9,20 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.rotations import rotation_from_quat
-from beags_plugin.core.sh import num_sh_bases
+from beags_plugin.core.sh import SH_C0, num_sh_bases
 from beags_plugin.core.surfels import Surfels, opacities
 
 # As the official code of 2DGS (Huang et al., SIGGRAPH 2024) has them; scales are relative to the scene's extent.
 GRADIENT_THRESHOLD = 2e-4  # mean screen gradient from which a surfel is cloned or split
 CLONE_SCALE = 0.01  # a larger surfel is split, a smaller one cloned
 SPLIT_SHRINK = 1.6  # both halves of a split surfel are this much smaller
-PRUNE_OPACITY = 0.05  # fainter surfels go
-PRUNE_SCALE = 0.1  # larger surfels go
+PRUNE_OPACITY = 0.05  # fainter surfels are pruned
+PRUNE_SCALE = 0.1  # larger surfels are pruned
 RESET_OPACITY = 0.01
 INITIAL_OPACITY = 0.1
 # Ours, for runs that are shorter than the official ones: ``DensifyConfig.scaled`` makes no interval shorter than these.
-LEAST_EVERY = 50  # an interval must show the surfels to many views
+LEAST_EVERY = 50  # gradients must be averaged over many views
 LEAST_RESET_EVERY = 1_000  # opacities need time to recover
-SH_C0 = 0.28209479177387814  # value of the constant basis function
 COINCIDENT = 1e-7  # smallest initial scale relative to the cloud's size: coincident points have no neighbour distance
 
 
@@ -34,27 +33,27 @@ class DensifyConfig:
     every: int = 100
     """Steps between two rounds of growth and pruning."""
     start: int = 500
-    """They begin after this step."""
+    """Step after which growth and pruning begin."""
     stop: int = 15_000
-    """They end before this step."""
+    """Step before which growth and pruning end."""
     prune_scale_after: int = 3_000
-    """Gaussians larger than a tenth of the scene's extent go after this step; 0 keeps them."""
+    """Step after which Gaussians larger than a tenth of the scene's extent are pruned; 0 keeps them."""
     reset_every: int = 3_000
     """Steps between resets of all opacities to at most 0.01; 0 never."""
     far_limits: bool = False
-    """Measure the sizes from which Gaussians are split and pruned by the distance of the nearest camera where that
-    exceeds the scene's extent, for far backgrounds; False, as officially, by the extent alone."""
+    """Scale the size limits of splitting and pruning by the distance of the nearest camera where that exceeds the
+    scene's extent, for far backgrounds. False, the official rule, scales them by the extent alone."""
     max_surfels: int = 0
-    """Bound of the number of Gaussians, which bounds time and memory; 0 sets none."""
+    """Largest number of Gaussians, which bounds time and memory; 0 sets no bound."""
     pixels_per_surfel: float = 0.0
-    """Training pixels that each Gaussian needs at least, against overfitting of few images; 0, as officially, sets no
+    """Least number of training pixels per Gaussian, against overfitting to few images; 0, the official rule, sets no
     bound."""
     free_share: float = 0.0
-    """Share of the depth of the nearest seed points that a camera shows. Gaussians that reach nearer to that camera are
-    removed: they cover held-out photos. 0 keeps them, as does a scene whose seed points were generated."""
+    """Gaussians that reach nearer to a camera than this share of the depth of its nearest seed points are removed,
+    because they cover held-out photos. 0 keeps them, and so does a scene whose seed points were generated."""
 
     def scaled(self, factor: float) -> DensifyConfig:
-        """Return the same for a run ``factor`` times as long: its steps are scaled, within the smallest intervals."""
+        """Return these options for a run ``factor`` times as long; no interval falls below the least ones."""
 
         def steps(stated: int, least: int = 0) -> int:
             return max(round(stated * factor), min(least, stated)) if stated > 0 else stated
@@ -69,7 +68,7 @@ class DensifyConfig:
         )
 
     def bounded(self, pixels: int) -> DensifyConfig:
-        """Return the same with ``max_surfels`` for this many training pixels."""
+        """Return these options with ``max_surfels`` for this many training pixels."""
         if not self.pixels_per_surfel > 0:
             return self
         by_pixels = max(int(pixels / self.pixels_per_surfel), 1)
@@ -90,7 +89,7 @@ class DensifyConfig:
 
 @dataclass(frozen=True)
 class Densified:
-    """The edited scene: M surfels, for each the index [M] it came from and whether it is fresh [M] bool."""
+    """The edited scene: M surfels, the index [M] that each came from, and whether it is new, fresh [M] bool."""
 
     surfels: Surfels
     source: Tensor
@@ -132,9 +131,10 @@ class GradientStatistics:
 
 
 def length_units(means: Tensor, camera_centers: Tensor, extent: float, config: DensifyConfig) -> Tensor:
-    """Return [N] world units in which ``CLONE_SCALE`` and ``PRUNE_SCALE`` of surfels at ``means`` [N, 3] are stated.
+    """Return the lengths [N], world units, that ``CLONE_SCALE`` and ``PRUNE_SCALE`` multiply for surfels at ``means``.
 
-    camera_centers: [V, 3]. The scene's extent, or with ``far_limits`` the distance of the nearest camera if larger.
+    They are the scene's extent, or with ``far_limits`` the distance of the nearest camera if larger. means: [N, 3].
+    camera_centers: [V, 3].
     """
     units = means.new_full((means.shape[0],), extent)
     if not config.far_limits:
@@ -150,11 +150,11 @@ def densify(
     surfels: Surfels, mean_gradient: Tensor, units: Tensor, config: DensifyConfig, step: int,
     generator: torch.Generator, apart: tuple[Tensor, int] | None = None,
 ) -> Densified:  # fmt: skip
-    """Clone, split, prune.
+    """Clone, split and prune surfels.
 
-    surfels: N surfels without gradients. mean_gradient: [N]. units: [N] of ``length_units``. step: for
-    ``prune_scale_after``. apart: [N] bool, surfels with a bound of their own, and that bound (0: none); the config's is
-    that of the others. At least one surfel always remains.
+    surfels: N surfels without gradients. mean_gradient: [N]. units: [N] of ``length_units``. step: the current step,
+    for ``prune_scale_after``. apart: [N] bool, surfels with a bound of their own, and that bound (0: none); the
+    config's bounds the others. At least one surfel always remains.
     """
     size = surfels.log_scales.exp().amax(dim=-1)
     chosen = mean_gradient >= GRADIENT_THRESHOLD
@@ -175,9 +175,9 @@ def densify(
 
 
 def split_by_sampling(surfels: Surfels, chosen: Tensor, generator: torch.Generator) -> Densified:
-    """Replace each chosen surfel by two, placed by its own Gaussian and smaller by ``SPLIT_SHRINK``; else its copies.
+    """Replace each chosen surfel by two copies, placed by its own Gaussian and smaller by ``SPLIT_SHRINK``.
 
-    surfels: N surfels without gradients. chosen: [N] bool. The others keep their order; the halves follow them. This
+    surfels: N surfels without gradients. chosen: [N] bool. The others keep their order; the copies follow them. This
     is the split of densification.
     """
     return _grow(surfels, torch.zeros_like(chosen), chosen, generator)
@@ -185,22 +185,19 @@ def split_by_sampling(surfels: Surfels, chosen: Tensor, generator: torch.Generat
 
 def _grow(surfels: Surfels, cloned: Tensor, split: Tensor, generator: torch.Generator) -> Densified:
     """Add copies of the ``cloned`` [N] bool, then replace each ``split`` [N] bool by two; see ``split_by_sampling``."""
-    kept, clones, splits = (which.nonzero()[:, 0] for which in (~split, cloned, split))
-    source = torch.cat([kept, clones, splits, splits])
+    rest, clones, splits = (which.nonzero()[:, 0] for which in (~split, cloned, split))
+    source = torch.cat([rest, clones, splits, splits])
     fresh = torch.zeros_like(source, dtype=torch.bool)
-    fresh[kept.shape[0] :] = True
+    fresh[rest.shape[0] :] = True
     grown = surfels[source]
-    halves = slice(kept.shape[0] + clones.shape[0], None)
+    halves = slice(rest.shape[0] + clones.shape[0], None)
     grown.means[halves] += _offsets(grown[halves], generator)
     grown.log_scales[halves] -= math.log(SPLIT_SHRINK)
     return Densified(grown, source, fresh)
 
 
 def _within_budget(chosen: Tensor, gradient: Tensor, max_surfels: int, count: int) -> Tensor:
-    """Restrict the chosen to those of largest gradient that ``max_surfels`` leaves room for (0: no bound).
-
-    count: of the surfels under that bound.
-    """
+    """Restrict the chosen to those of largest gradient that fit beside ``count`` surfels (``max_surfels`` 0: all)."""
     room = max(max_surfels - count, 0)
     if max_surfels <= 0 or int(chosen.sum()) <= room:
         return chosen
@@ -225,7 +222,7 @@ def reset_opacity(surfels: Surfels) -> Tensor:
 
 
 def initial_surfels(points: Tensor, colors: Tensor, sh_degree: int, generator: torch.Generator) -> Surfels:
-    """Make one surfel per seed point: as large as its neighbours are far, faint, turned at random.
+    """Make one surfel per seed point: sized by the distance of its neighbours, faint and randomly rotated.
 
     points: [N, 3] world. colors: [N, 3] in 0..1. Returns N surfels in float32 without gradients.
     """

@@ -1,4 +1,4 @@
-"""Exposures of photos: how bright each is beside their mean, from the places that several of them show."""
+"""Exposures of photos relative to their mean, from the places that several photos show."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from torch import Tensor
 
 from beags_plugin.core.color_fit import apply_affine
 
-DARK, BRIGHT = 0.02, 0.95  # Linear light; outside this range noise and clipping say nothing about exposure.
-_RIDGE = 1e-3  # It keeps photos that share no place with others solvable: a share of all photos' mean evidence.
+DARK, BRIGHT = 0.02, 0.95  # Linear light; outside this range noise and clipping hide the exposure.
+_RIDGE = 1e-3  # share of the photos' mean evidence; it determines photos that share no place with others
 _ROUNDS = 12  # rounds of reweighting, which turn least squares into least absolute differences
 _LEAST_RESIDUAL = 0.02  # log2 units; a smaller residual counts no more than this one
 _NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 _MEDIAN_COST = 1.25  # standard error of a median over that of a mean
-_LEAST_GAIN = 0.02  # of a transform that can be inverted; a photo of less is black, and evening it out shows noise
+_LEAST_GAIN = 0.02  # least singular value to invert; a photo below it is black, and its inverse would show noise
 
 
 @dataclass(frozen=True)
 class Exposures:
     """The affine colour transforms from a scene, which has the mean photo's exposure, to each of its photos.
 
-    names: of V photos. affine: [V, 3, 4] float, of colours in the photos' values, see ``color_fit.apply_affine``.
+    names: those of V photos. affine: [V, 3, 4] float, on colours in the photos' values, see ``color_fit.apply_affine``.
     """
 
     names: tuple[str, ...]
@@ -33,7 +33,7 @@ class Exposures:
     def evened(self, photo: Tensor, name: str) -> Tensor:
         """Return a photo [H, W, 3] in 0..1 with the mean photo's exposure.
 
-        It is returned as it is where its transform is not known, or cannot be inverted, as a black photo's.
+        A photo whose transform is unknown, or cannot be inverted (a black photo's), is returned unchanged.
         """
         if name not in self.names:
             return photo
@@ -46,7 +46,7 @@ class Exposures:
 
 
 def not_beyond_white(color: Tensor, photo: Tensor) -> Tensor:
-    """Return a rendering [H, W, 3], without gradient where the photo is burnt out and the rendering brighter still.
+    """Return a rendering [H, W, 3] that has no gradient where the photo is saturated and the rendering brighter.
 
     A photo cuts light off at 1, so it does not contradict a scene that is brighter there.
     """
@@ -66,7 +66,7 @@ class Sightings:
 class Gains:
     """How many stops each of V photos is brighter than their mean: stops [V, 3], by colour, each with a mean of 0.
 
-    noise: [V], what these may err by, as their source tells it; infinite for a photo without any evidence.
+    noise: [V], the standard error of the stops; infinite for a photo without any evidence.
     """
 
     stops: np.ndarray
@@ -79,16 +79,16 @@ class Gains:
 
     @property
     def spread_of_colors(self) -> float:
-        """Return the standard deviation of what the colours of a photo differ from its gain by, in EV."""
+        """Return the standard deviation of the gains by colour about their photo's gain, in EV."""
         return float((self.stops - self.stops.mean(axis=1, keepdims=True)).std())
 
 
 def gains(sightings: Sightings, count: int) -> Gains:
-    """Return the gains of ``count`` photos that explain best in which light they show the same places.
+    """Return the gains of ``count`` photos that explain best how bright each shows the same places.
 
-    log2 light of place p in photo v = log2 colour of p + gain of v, for the least absolute difference by reweighted
-    least squares: reflections and wrong matches are outliers. A place counts that two photos or more show neither dark
-    nor bright.
+    log2 light of place p in photo v = log2 colour of p + gain of v, with the least absolute error by reweighted least
+    squares, because reflections and wrong matches are outliers. A place counts if two photos or more show it neither
+    dark nor bright.
     """
     usable = ((sightings.light > DARK) & (sightings.light < BRIGHT)).all(axis=1)
     _, inverse = np.unique(sightings.place, return_inverse=True)
@@ -99,14 +99,14 @@ def gains(sightings: Sightings, count: int) -> Gains:
     for channel in range(3):
         weights = np.ones(len(logs))
         for _ in range(_ROUNDS if len(logs) else 0):
-            found, colors = even_exposures(place, photo, logs[:, channel], weights, count)
-            residuals[:, channel] = logs[:, channel] - colors[place] - found[photo]
+            exposures, colors = even_exposures(place, photo, logs[:, channel], weights, count)
+            residuals[:, channel] = logs[:, channel] - colors[place] - exposures[photo]
             weights = 1.0 / np.maximum(np.abs(residuals[:, channel]), _LEAST_RESIDUAL)
-            stops[:, channel] = found - found.mean()
+            stops[:, channel] = exposures - exposures.mean()
     seen = np.bincount(photo, minlength=count)
     spread = _NORMAL * float(np.median(np.abs(residuals))) if len(logs) else 0.0
     noise = np.where(seen > 0, _MEDIAN_COST * spread / np.sqrt(np.maximum(seen, 1)), np.inf)
-    return Gains(np.round(stops, 5), noise)  # Rounded, so that no last bit of a solver tells.
+    return Gains(np.round(stops, 5), noise)  # Rounding removes the solver's last bits, which differ by machine.
 
 
 def even_exposures(
@@ -114,8 +114,8 @@ def even_exposures(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the log exposure of each photo, [count], with a mean of about 0, and the log colour of each place, [P].
 
-    Weighted least squares: log light of place p in photo v = log colour of p + log exposure of v. The colours are
-    solved for first, which leaves a Laplacian of the photos.
+    Weighted least squares: log light of place p in photo v = log colour of p + log exposure of v. Eliminating the
+    colours leaves a Laplacian over the photos.
 
     place, photo: [M] int64, no pair twice. logs, weights: [M] float64.
     """
@@ -129,12 +129,12 @@ def even_exposures(
     right = np.bincount(photo, weights * (logs - colors[place]), count)
     laplacian = np.diag(evidence) - (csr_matrix((weights, (place, photo)), (places, count)).T @ shares).toarray()
     ridge = _RIDGE * evidence.mean() + 1e-12
-    found = np.linalg.solve(laplacian + ridge * np.eye(count), right)
-    return found, colors - np.bincount(place, weights * found[photo], places) / of_place
+    exposures = np.linalg.solve(laplacian + ridge * np.eye(count), right)
+    return exposures, colors - np.bincount(place, weights * exposures[photo], places) / of_place
 
 
 def sightings(ids: Sequence[np.ndarray], light: Sequence[np.ndarray]) -> Sightings:
-    """Gather what each photo shows of places: per photo, ids [M] int64 (below 0: of no place) and light [M, 3].
+    """Gather the observations of all photos: per photo, ids of places [M] int64 (below 0: no place), light [M, 3].
 
     Of several observations of a place by a photo the first counts.
     """

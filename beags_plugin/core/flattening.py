@@ -10,7 +10,7 @@ from torch import Tensor
 from beags_plugin.core.rotations import quat_product
 from beags_plugin.core.surfels import Surfels
 
-_ROUND = 0.5  # thinnest axis relative to the second from which flattening changes what a Gaussian looks like
+_ROUND = 0.5  # ratio of the thinnest scale to the second above which flattening visibly changes a Gaussian
 # Quaternions wxyz that turn the x, y and z axis to the axes (k + 1, k + 2, k), for k = 0, 1, 2: the axis k becomes the
 # normal, and the three stay right-handed.
 _AXES_TO = ((0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1.0, 0.0, 0.0, 0.0))
@@ -35,7 +35,7 @@ class Gaussians:
         return self.means.shape[0]
 
     def __getitem__(self, selection) -> Gaussians:
-        """Return those that a mask [N] bool or an index [M] int64 selects."""
+        """Return the Gaussians that a mask [N] bool or an index [M] int64 selects."""
         return Gaussians(**{field.name: getattr(self, field.name)[selection] for field in fields(self)})
 
     def usable(self) -> Tensor:
@@ -50,9 +50,9 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Flattening:
-    """Volume that N > 0 Gaussians lost.
+    """How thick N > 0 Gaussians were before they were flattened.
 
-    median_ratio: median of thinnest over second scale; 0 is flat already, 1 a disc turned into one of its sections.
+    median_ratio: median ratio of the thinnest scale to the second; 0: flat already, 1: as thick as wide.
     round_share: share of the Gaussians whose ratio is above 0.5.
     """
 
@@ -63,23 +63,23 @@ class Flattening:
 def flatten(gaussians: Gaussians) -> tuple[Surfels, Flattening | None]:
     """Return surfels in the plane of each Gaussian's two larger axes, with its opacity and colour.
 
-    Those whose thinnest axis is the third keep their quaternion as it is. Returns (N surfels, what was lost; None of
-    Gaussians that are surfels already, or of none). Infinite opacity logits become 30, which is opaque.
+    Those whose thinnest axis is the third keep their quaternion. Returns N surfels, and how thick the Gaussians were
+    (None if they are surfels already, or if N is 0). Infinite opacity logits become 30, which is opaque.
     """
     logits = gaussians.opacity_logits.nan_to_num(posinf=30.0, neginf=-30.0)
-    quats, scales, lost = gaussians.quats, gaussians.log_scales, None
+    quats, scales, thickness = gaussians.quats, gaussians.log_scales, None
     if scales.shape[1] == 3:
-        lost = flattening(scales)
-        # of equal scales the last, so that a sphere keeps its axes
+        thickness = flattening(scales)
+        # The last of equal scales counts as the thinnest, so that a sphere keeps its axes.
         thinnest = 2 - scales.flip(1).argmin(dim=1)
         turned = quat_product(quats, quats.new_tensor(_AXES_TO)[thinnest])
         quats = torch.where((thinnest == 2)[:, None], quats, turned)
         scales = scales.gather(1, torch.stack([(thinnest + 1) % 3, (thinnest + 2) % 3], dim=1))
-    return Surfels(gaussians.means, quats, scales, logits, gaussians.sh_dc, gaussians.sh_rest), lost
+    return Surfels(gaussians.means, quats, scales, logits, gaussians.sh_dc, gaussians.sh_rest), thickness
 
 
 def without_empty_bands(surfels: Surfels) -> Surfels:
-    """Lower the SH degree while its coefficients are 0 in all surfels, as some formats pad with."""
+    """Lower the SH degree while the coefficients of its highest band are all 0: some formats pad with zeros."""
     degree = surfels.sh_degree
     while degree > 0 and not bool(surfels.sh_rest[:, degree**2 - 1 : (degree + 1) ** 2 - 1].any()):
         degree -= 1
@@ -87,7 +87,7 @@ def without_empty_bands(surfels: Surfels) -> Surfels:
 
 
 def flattening(log_scales: Tensor) -> Flattening | None:
-    """Measure what flattening takes from Gaussians of these scales [N, 3]; None of none."""
+    """Measure how thick Gaussians of these log scales [N, 3] are; None if N is 0."""
     if len(log_scales) == 0:
         return None
     ordered = log_scales.double().sort(dim=1).values

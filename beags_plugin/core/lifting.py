@@ -9,7 +9,7 @@ from beags_plugin.core.cameras import Camera
 
 MARGIN = 1.3
 TAU = 0.02
-"""Depths that differ by at most this share lie on one surface; something nearer by more hides it (method, E5)."""
+"""Depths that differ by at most this share lie on one surface; a surface nearer by more hides it (method, E5)."""
 
 
 def pixel_rays(camera: Camera, like: Tensor) -> Tensor:
@@ -50,21 +50,31 @@ def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def pixels_under(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Return which points lie inside the picture and in front of the camera, and in which pixels.
+    """Return the points inside the image and in front of the camera, and their pixels.
 
     points: [P, 3] float. Returns three tensors [S] int64: indices of the points, ascending; rows; columns.
     """
-    xy, z = project(points, camera)
-    inside = (z > 0) & (xy >= 0).all(dim=-1) & (xy[:, 0] < camera.width) & (xy[:, 1] < camera.height)
+    inside, row, column, _ = pixels_of(points, camera)
     places = inside.nonzero()[:, 0]
-    column, row = xy[places].long().unbind(dim=-1)
-    return places, row, column
+    return places, row[places], column[places]
+
+
+def pixels_of(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return which points lie inside the image and in front of the camera, and the pixels and depths of all.
+
+    points: [P, 3] float. Returns inside [P] bool; rows and columns [P] int64, any in the image where not inside; z [P].
+    """
+    xy, z = project(points, camera)
+    limit = torch.tensor([camera.width, camera.height], device=xy.device)
+    inside = (z > 0) & ((xy >= 0) & (xy < limit)).all(dim=-1)
+    column, row = xy.nan_to_num().floor().long().clamp(min=0).minimum(limit - 1).unbind(dim=-1)
+    return inside, row, column, z
 
 
 def project_directions(directions: Tensor, points: Tensor, camera: Camera) -> Tensor:
-    """Return J W d, [P, 2] pixels: how far each point moves in the picture per unit step along its direction.
+    """Return J W d, [P, 2] pixels: how far each point moves in the image per unit step along its direction.
 
-    As in 3D Gaussian splatting, J is taken at the nearest point within ``MARGIN`` times the picture's half width and
+    As in 3D Gaussian splatting, J is taken at the nearest point within ``MARGIN`` times the image's half width and
     height, because it grows without bound outside.
 
     directions, points: [P, 3] float, the points in front of the camera.
@@ -81,7 +91,7 @@ def project_directions(directions: Tensor, points: Tensor, camera: Camera) -> Te
 def _times(rows: Tensor, matrix: Tensor) -> Tensor:
     """Return rows [..., 3] times a matrix [3, 3].
 
-    Determinism: the product of a library may differ between machines and numbers of threads.
+    Determinism: the matrix product of a library may differ between machines and numbers of threads.
     """
     x, y, z = rows.unbind(-1)
     return torch.stack([x * matrix[0, c] + y * matrix[1, c] + z * matrix[2, c] for c in range(3)], dim=-1)

@@ -14,8 +14,8 @@ class Membership:
     """Which of N Gaussians belong to which class.
 
     class_ids: [N] int32, phi, the one class in which a viewer shows each Gaussian.
-    objects: object id to [M] int64, its Gaussians, ascending; they may share Gaussians and leave some to nobody. The
-        background's, 0, are then those of no object. None: each Gaussian belongs to its class alone.
+    objects: object id to [M] int64, its Gaussians, ascending. Objects may share Gaussians; those of no object belong to
+        the background, 0. None: each Gaussian belongs to its class alone.
     """
 
     class_ids: Tensor
@@ -28,11 +28,11 @@ class Membership:
         """Return [N] bool, the Gaussians of a class."""
         if self.objects is None:
             return self.class_ids == class_id
-        found = torch.zeros_like(self.class_ids, dtype=torch.bool)
+        inside = torch.zeros_like(self.class_ids, dtype=torch.bool)
         for each in self.objects.values() if class_id == 0 else [self.objects.get(class_id)]:
             if each is not None:
-                found[each.to(found.device)] = True
-        return ~found if class_id == 0 else found
+                inside[each.to(inside.device)] = True
+        return ~inside if class_id == 0 else inside
 
     def present(self) -> list[int]:
         """Return the ascending ids of the classes that have Gaussians."""
@@ -42,7 +42,7 @@ class Membership:
         return background + sorted(class_id for class_id, each in self.objects.items() if len(each))
 
     def __getitem__(self, index: Tensor) -> Membership:
-        """Return that of the Gaussians ``index`` [M] int64 alone, some of them perhaps repeated."""
+        """Return the membership of the Gaussians ``index`` [M] int64, which may repeat."""
         class_ids = self.class_ids[index]
         if self.objects is None:
             return Membership(class_ids)
@@ -50,17 +50,13 @@ class Membership:
 
     @classmethod
     def of_masks(cls, masks: Mapping[int, Tensor], class_ids: Tensor) -> Membership:
-        """Return that of object id to [N] bool; class_ids: [N] int32, phi.
+        """Return the membership of object id to [N] bool; class_ids: [N] int32, phi.
 
-        A Gaussian of several objects is shown in phi if that is among them, else in the lowest of them.
+        A Gaussian of several objects keeps its class in phi if that is among them, else gets the lowest of them.
         """
-        shown = class_ids.clone()
-        inside = torch.zeros_like(shown, dtype=torch.bool)
+        phi = torch.zeros_like(class_ids)
         for class_id in sorted(masks, reverse=True):
-            mask = masks[class_id]
-            inside |= mask
-            shown[mask & (class_ids != class_id)] = class_id
+            phi[masks[class_id]] = class_id
         for class_id, mask in masks.items():
-            shown[mask & (class_ids == class_id)] = class_id
-        shown[~inside] = 0
-        return cls(shown, {class_id: mask.nonzero()[:, 0] for class_id, mask in masks.items()})
+            phi[mask & (class_ids == class_id)] = class_id
+        return cls(phi, {class_id: mask.nonzero()[:, 0] for class_id, mask in masks.items()})

@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 class Region(ABC):
-    """A closed region of space. Its numbers are finite, in the frame and units of the points asked about."""
+    """A closed region of space. Its numbers are finite, in the frame and units of the points to be tested."""
 
     @abstractmethod
     def contains(self, points: Tensor) -> Tensor:
@@ -36,7 +36,7 @@ class Block(Region):
 
 @dataclass(frozen=True)
 class Ball(Region):
-    """What lies within ``radius`` of ``center`` (x, y, z); raises ``ValueError`` unless the radius is above 0."""
+    """The points within ``radius`` of ``center`` (x, y, z); raises ``ValueError`` unless the radius is above 0."""
 
     center: tuple[float, float, float]
     radius: float

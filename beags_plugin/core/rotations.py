@@ -6,14 +6,14 @@ import torch
 from torch import Tensor
 
 LONGEST_QUAT = 1e12
-"""Quaternions longer than this, or shorter than one part of it, count as broken wherever surfels are used.
+"""Quaternions longer than this, or shorter than its reciprocal, count as broken wherever surfels are used.
 
-Their gradient is the rotation's divided by the length, and would overflow in float32.
+The gradient of a quaternion is that of its rotation divided by its length, which would overflow in float32.
 """
 
 
 def usable_quats(quats: Tensor) -> Tensor:
-    """Return [...] bool: whether quats [..., 4] have a length that can be divided by; NaN has none. No gradient."""
+    """Return [...] bool: whether the lengths of quats [..., 4] can be divided by; that of NaN cannot. No gradient."""
     length = quats.detach().double().norm(dim=-1)
     return (length >= 1.0 / LONGEST_QUAT) & (length <= LONGEST_QUAT)
 

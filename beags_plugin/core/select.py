@@ -12,7 +12,7 @@ def select_class(surfels: Surfels, members: Membership, class_id: int) -> tuple[
     """Return the Gaussians of one class, with all their parameters.
 
     surfels: N Gaussians. members: their classes. Returns the M Gaussians of the class and their indices among the N,
-    [M] int64, ascending. Raises ``ValueError`` if ``members`` is of another number of Gaussians.
+    [M] int64, ascending. Raises ``ValueError`` if ``members`` describes another number of Gaussians.
     """
     return _select(surfels, members, members.of(class_id))
 

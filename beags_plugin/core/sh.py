@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from beags_plugin.ops import cuda_extension, extension
+from beags_plugin.ops import cuda_extension
 from beags_plugin.ops import sh_colors as compiled
 
 MAX_DEGREE = 3
 
 # Normalisation of the real basis, band by band: the integral of each squared function over the sphere is 1. Signs and
-# order are those of the splat files in circulation, so that their colours look right.
-_C0 = 0.28209479177387814  # 1/2 sqrt(1 / pi)
+# order are those that splat files use, so that their colours are right.
+SH_C0 = 0.28209479177387814  # 1/2 sqrt(1 / pi)
 _C1 = 0.4886025119029199  # 1/2 sqrt(3 / pi)
 _C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)  # 1/2 sqrt(15/pi), 1/4 sqrt(5/pi), 1/4 sqrt(15/pi)
 _C3 = (
@@ -34,7 +34,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"the degree of spherical harmonics must be 0..{MAX_DEGREE}, not {degree}")
     x, y, z = directions.unbind(-1)
-    values = [torch.full_like(x, _C0)]
+    values = [torch.full_like(x, SH_C0)]
     if degree >= 1:
         values += [-_C1 * y, _C1 * z, -_C1 * x]
     if degree >= 2:
@@ -64,13 +64,12 @@ def sh_colors(sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_center: Tens
     sh_dc: [N, 3], degree 0. sh_rest: [N, K, 3], the others, K >= (degree + 1)^2 - 1. means: [N, 3] world.
     camera_center: [3] world, on any device. Returns [N, 3]. Computed by the compiled op where it can be.
     """
-    compiles = extension.supports(sh_dc, sh_rest, means, camera_center)
-    compiles = compiles or cuda_extension.module_for(sh_dc, sh_rest, means) is not None
-    if compiles and not camera_center.requires_grad:
+    constant = camera_center.dtype == means.dtype and not camera_center.requires_grad
+    if constant and cuda_extension.supports(sh_dc, sh_rest, means):
         return compiled.sh_colors(sh_dc, sh_rest, means, camera_center, degree)
     if degree == 0:
-        return (_C0 * sh_dc + 0.5).clamp_min(0.0)
-    # eps 1e-12: a surfel at the camera
+        return (SH_C0 * sh_dc + 0.5).clamp_min(0.0)
+    # A surfel at the camera has direction 0: normalize divides by 1e-12 at least.
     directions = torch.nn.functional.normalize(means - camera_center.to(means), dim=-1)
     basis = sh_basis(directions, degree)
     sh = torch.cat([sh_dc[:, None], sh_rest[:, : basis.shape[1] - 1]], dim=1)

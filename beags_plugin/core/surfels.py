@@ -17,8 +17,8 @@ class Surfels:
     log_scales: [N, 2] natural logs of the two scales, world units.
     opacity_logits: [N] logits of the opacity.
     sh_dc: [N, 3] spherical-harmonic coefficients of the colour, degree 0. They have a learning rate of their own.
-    sh_rest: [N, (degree + 1)^2 - 1, 3] coefficients of the higher degrees. One tensor for all degrees would have to be
-        copied in every step.
+    sh_rest: [N, (degree + 1)^2 - 1, 3] coefficients of the higher degrees; in a tensor of their own, because joining
+        two learning rates in one would copy it in every step.
     """
 
     means: Tensor
@@ -30,7 +30,7 @@ class Surfels:
 
     @classmethod
     def of(cls, means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, sh: Tensor) -> Surfels:
-        """Make Gaussians from one tensor of all coefficients, sh [N, (degree + 1)^2, 3], of which they hold views."""
+        """Make Gaussians that hold views of one tensor of all coefficients, sh [N, (degree + 1)^2, 3]."""
         return cls(means, quats, log_scales, opacity_logits, sh[:, 0], sh[:, 1:])
 
     @property
@@ -67,6 +67,6 @@ def opacities(logits: Tensor) -> Tensor:
     """Return opacities in 0..1, of the shape of ``logits``; differentiable, with a gradient of 0 below logits of -80.
 
     Below -80, where the opacity is 1e-35, 1 / (1 + exp) would have no finite gradient. Determinism: torch.sigmoid
-    rounds differently at the ends of each thread's share, exp does not.
+    rounds differently at the ends of each thread's range, exp does not.
     """
     return 1.0 / (1.0 + torch.exp(-logits.clamp_min(-80.0)))

@@ -1,4 +1,4 @@
-"""Exporters, each a registered component (entry points: ``beags.exporters``)."""
+"""Exporters, in a registry of lazy specs (entry points: ``beags.exporters``)."""
 
 from beags_plugin.system.registry import Registry
 

@@ -19,19 +19,16 @@ class Exporter(ABC):
     """One file format. Subclasses are frozen dataclasses; their own fields, all with defaults, are their options.
 
     suffix: how the files' names end. needs_views: whether it renders the item from the views of the training photos.
-    needs_metres: whether its files state a unit of length. holds_gaussians: whether they hold Gaussians; where objects
-    are closed, its items then have more of these, and else it closes them itself.
+    needs_photos: whether it reads the photos themselves. needs_metres: whether its files state a unit of length.
+    holds_gaussians: whether the files hold Gaussians. Where objects are closed, items of such exporters have additional
+    Gaussians; other exporters close the objects themselves.
     """
 
     suffix: ClassVar[str]
     needs_views: ClassVar[bool] = False
+    needs_photos: ClassVar[bool] = False
     needs_metres: ClassVar[bool] = False
     holds_gaussians: ClassVar[bool] = True
-
-    @property
-    def needs_photos(self) -> bool:
-        """Return whether it looks at the photos themselves."""
-        return False
 
     @classmethod
     def unavailable(cls) -> str | None:
@@ -39,7 +36,7 @@ class Exporter(ABC):
         return None
 
     def to_world(self, path: Path, origin: Tensor) -> bool:
-        """Move a file that ``write`` made about ``origin`` [3] float64 to the world, in double precision.
+        """Move a file that ``write`` made relative to ``origin`` [3] float64 to the world, in double precision.
 
         Returns False, and changes nothing, where the format cannot hold it.
         """
@@ -49,7 +46,7 @@ class Exporter(ABC):
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
         """Write ``item`` to ``path``; return the manifest's entries about the file (plain values by name).
 
-        Raises ``UserError`` if the file cannot be written, ``NothingToExport`` if the item has nothing for it.
+        Raises ``UserError`` if the file cannot be written, ``NothingToExport`` if the item holds nothing for it.
         """
 
 

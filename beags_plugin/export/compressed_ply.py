@@ -1,8 +1,8 @@
 """Gaussians as a compressed .ply: 16 bytes each, and one more for each coefficient of the higher bands.
 
-Written from descriptions of PlayCanvas' format. A binary little-endian .ply of three elements: "chunk" has the least
-and the greatest values of 256 Gaussians each; "vertex" has their places between these, packed into four 32-bit words;
-"sh", which files of degree 0 lack, has a byte a coefficient, channel-major as in other splat .ply files.
+Written from descriptions of PlayCanvas' format. A binary little-endian .ply of three elements: "chunk" holds the
+smallest and largest values of 256 Gaussians each; "vertex" their positions between these, packed into four 32-bit
+words; "sh", which files of degree 0 lack, a byte per coefficient, channel-major as in other splat .ply files.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from beags_plugin.core.densification import SH_C0
+from beags_plugin.core.sh import SH_C0
 from beags_plugin.export.base import Exporter
 from beags_plugin.export.splat_values import SplatValues, smallest_three, splat_values
-from beags_plugin.splat_io.files import whole_file
+from beags_plugin.splat_io.files import write_bytes
 from beags_plugin.splat_io.ply import DISC_COMMENT
 from beags_plugin.surfaces.item import ExportItem
 
@@ -26,14 +26,12 @@ _SH_RANGE = 8.0  # coefficients of the higher bands lie in -4..4
 
 @dataclass(frozen=True)
 class CompressedPlyExporter(Exporter):
-    """PlayCanvas' compressed .ply: SuperSplat, the PlayCanvas engine, three.js' viewers. No place for class ids."""
+    """PlayCanvas' compressed .ply: SuperSplat, the PlayCanvas engine, three.js' viewers. It cannot hold class ids."""
 
     suffix: ClassVar[str] = "compressed.ply"
 
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
-        content = compressed_ply(splat_values(item.surfels, item.name))
-        with whole_file(path) as part:
-            part.write_bytes(content)
+        write_bytes(path, compressed_ply(splat_values(item.surfels, item.name)))
         return {}
 
 
@@ -45,7 +43,7 @@ def compressed_ply(values: SplatValues) -> bytes:
     columns, words = [], {}
     colors = values.sh_dc * SH_C0 + 0.5
     for name, block in (("position", values.means), ("scale", values.log_scales), ("color", colors)):
-        # rounded to the file's float32 first, so that what is packed lies between the ends that are read
+        # Rounding to the file's float32 comes first, so that packed values lie between the bounds that readers get.
         low, high = (ends.reduceat(block, starts).astype("<f4") for ends in (np.minimum, np.maximum))
         extent = high.astype(np.float64) - low
         places = (block - low[of]) / np.where(extent > 0, extent, 1.0)[of]
@@ -56,7 +54,7 @@ def compressed_ply(values: SplatValues) -> bytes:
     words["rotation"] = largest.astype(np.uint32) << np.uint32(30) | _packed(others / 2 + 0.5, (10, 10, 10))
     vertices = np.stack([words[name] for name in ("position", "rotation", "scale", "color")], axis=1)
     rest = values.sh_rest.transpose(0, 2, 1).reshape(count, -1)
-    # a byte stands for the middle of its 256th of the range
+    # A byte stands for the middle of its 256th of the range.
     steps = np.floor(256.0 * (rest / _SH_RANGE + 0.5)).clip(0, 255).astype(np.uint8)
     header = _header(len(starts), count, rest.shape[1])
     return b"".join(
@@ -65,7 +63,7 @@ def compressed_ply(values: SplatValues) -> bytes:
 
 
 def _packed(places: np.ndarray, bits: tuple[int, int, int]) -> np.ndarray:
-    """Return [N] uint32: three numbers of [N, 3] 0..1 with so many bits each, the first in the highest."""
+    """Return [N] uint32: the numbers of [N, 3] in 0..1 with ``bits`` each, the first in the highest bits."""
     word = np.zeros(len(places), np.uint32)
     for axis, width in enumerate(bits):
         most = 2**width - 1

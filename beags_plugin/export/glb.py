@@ -1,8 +1,7 @@
 """A mesh as binary glTF 2.0, with a texture or with colours of its vertices.
 
-No library at hand writes what photographed colours need: unlit, and where vertices have them finer than 8 bits, since
-8 bits of glTF's linear vertex colours leave too few dark tones. (glTF 2.0, sections 3.7.2, 3.8, 3.9;
-KHR_materials_unlit)
+Photographed colours need an unlit material, and vertex colours of 16 bits, because 8 bits of glTF's linear colours
+leave too few dark tones; no library at hand writes both. (glTF 2.0, sections 3.7.2, 3.8, 3.9; KHR_materials_unlit)
 """
 
 from __future__ import annotations
@@ -39,11 +38,11 @@ def glb_bytes(mesh: Mesh, name: str, texture: Texture | None = None, invented: n
 def add_mesh(
     document: Document, mesh: Mesh, name: str, texture: Texture | None = None, invented: np.ndarray | None = None
 ) -> int:
-    """Append a node, its mesh with normals, and an unlit material; return the number of the node.
+    """Append a node, its mesh with normals, and an unlit material; return the index of the node.
 
-    Colours are those of the texture, a .png, or without it linear 16-bit ones of the vertices. The mesh has z up and
-    the file y, as glTF demands: the places are turned, as some readers ignore nodes' matrices.
-    invented: [V] bool; with it vertices have the attribute ``_INVENTED``, 1 where nothing but closing put them.
+    Colours are those of the texture, a .png, or without it linear 16-bit colours of the vertices. The mesh has z up and
+    the file y, as glTF demands; the positions themselves are turned, because some readers ignore nodes' matrices.
+    invented: [V] bool; with it vertices have the attribute ``_INVENTED``, 1 where only closing put them.
     """
     source = np.arange(len(mesh.vertices)) if texture is None else texture.atlas.source
     faces = mesh.faces if texture is None else texture.atlas.faces
@@ -63,7 +62,7 @@ def add_mesh(
         image = document.add("images", bufferView=document.view(png_bytes(texture.image)), mimeType="image/png")
         material["baseColorTexture"] = {"index": document.add("textures", sampler=sampler, source=image)}
     if invented is not None:
-        # floats, as every reader takes them; names of an application's own begin with an underscore
+        # Every reader accepts floats; names of an application's own attributes begin with an underscore.
         attributes["_INVENTED"] = document.accessor(invented[source].astype("<f4"), FLOAT, "SCALAR")
     indices = document.accessor(faces.astype("<u4").reshape(-1), UNSIGNED_INT, "SCALAR", target=ELEMENT_ARRAY_BUFFER)
     unlit = {"extensions": {"KHR_materials_unlit": {}}, "doubleSided": True}
@@ -74,7 +73,7 @@ def add_mesh(
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """Return a picture [H, W, 3] uint8 as a .png."""
+    """Return an image [H, W, 3] uint8 as a .png."""
     from PIL import Image
 
     file = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Binary glTF 2.0 as it grows: nodes, meshes, materials and one buffer (sections 3.6 and 4.4 of its specification)."""
+"""Build binary glTF 2.0: nodes, meshes, materials and one buffer (sections 3.6 and 4.4 of its specification)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from beags_plugin.splat_io.files import whole_file
+from beags_plugin.splat_io.files import write_bytes
 
 UNSIGNED_BYTE, UNSIGNED_SHORT, UNSIGNED_INT, FLOAT = 5121, 5123, 5125, 5126
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
@@ -21,9 +21,9 @@ _LISTS = ("nodes", "meshes", "materials", "textures", "samplers", "images", "acc
 
 @dataclass
 class Document:
-    """A scene and what it refers to; every part of the buffer starts at a multiple of 4 bytes.
+    """A scene and the data it refers to; every part of the buffer starts at a multiple of 4 bytes.
 
-    lists: glTF's arrays by their names. roots: numbers of the nodes that stand at the top. extensions: those used.
+    lists: glTF's arrays by name. roots: indices of the top nodes. extensions: names of the extensions in use.
     """
 
     binary: bytearray = field(default_factory=bytearray)
@@ -32,18 +32,18 @@ class Document:
     extensions: set[str] = field(default_factory=set)
 
     def add(self, kind: str, **facts: Any) -> int:
-        """Append an entry to one of the arrays; return its number."""
+        """Append an entry to one of the arrays; return its index."""
         self.lists[kind].append(facts)
         return len(self.lists[kind]) - 1
 
     def view(self, data: bytes, **facts: Any) -> int:
-        """Append bytes; return the number of their bufferView."""
+        """Append bytes; return the index of their bufferView."""
         number = self.add("bufferViews", buffer=0, byteOffset=len(self.binary), byteLength=len(data), **facts)
         self.binary += data + b"\0" * (-len(data) % 4)
         return number
 
     def accessor(self, values: np.ndarray, kind: int, shape: str, target: int = ARRAY_BUFFER, **facts: Any) -> int:
-        """Append an array; return the number of its accessor."""
+        """Append an array; return the index of its accessor."""
         number = self.view(values.tobytes(), target=target)
         return self.add("accessors", bufferView=number, componentType=kind, count=len(values), type=shape, **facts)
 
@@ -61,7 +61,7 @@ class Document:
 
 
 def shifted(content: bytes, offset: Sequence[float]) -> bytes:
-    """Return a .glb of ``Document`` whose top nodes, which are not moved, stand at ``offset``: JSON holds doubles."""
+    """Return a .glb of ``Document`` with its top nodes, which had no translation, at ``offset``: JSON holds doubles."""
     (length,) = struct.unpack_from("<I", content, 12)
     document = json.loads(content[20 : 20 + length])
     for number in document["scenes"][0]["nodes"]:
@@ -80,20 +80,18 @@ def _glb(document: dict[str, Any], binary: bytes) -> bytes:
 
 
 def positions(places: np.ndarray, document: Document) -> int:
-    """Append places [V, 3] with their bounds, which glTF demands; return the number of their accessor."""
+    """Append positions [V, 3] with their bounds, which glTF demands; return the index of their accessor."""
     places = places.astype("<f4")
     bounds = {"min": places.min(axis=0).tolist(), "max": places.max(axis=0).tolist()}
     return document.accessor(places, FLOAT, "VEC3", **bounds)
 
 
 def y_up(vectors: np.ndarray) -> np.ndarray:
-    """Return vectors [V, 3] of a frame with z up in one with y up; z of ours is its y, and y its -z."""
+    """Return vectors [V, 3] of a frame with z up in one with y up: z becomes y, and y becomes -z."""
     return vectors[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
 
 
 def glb_to_world(path: Path, origin: Tensor) -> bool:
-    """Put the nodes of a .glb that was made about ``origin`` [3] float64, z up, where that lies; return True."""
-    content = shifted(path.read_bytes(), y_up(origin.numpy()[None])[0].tolist())
-    with whole_file(path) as part:
-        part.write_bytes(content)
+    """Move the nodes of a .glb that was made relative to ``origin`` [3] float64, z up, to the world; return True."""
+    write_bytes(path, shifted(path.read_bytes(), y_up(origin.numpy()[None])[0].tolist()))
     return True

@@ -1,7 +1,7 @@
 """Gaussians as binary glTF with KHR_gaussian_splatting, ratified in 2026: a node for each object, with its name.
 
-The extension's attributes: scales are lengths, opacities 0..1, rotations quaternions xyzw; the coefficients of the
-bands are those of splat .ply files, sign for sign. A viewer without the extension shows points in ``COLOR_0``.
+In the extension, scales are lengths, opacities 0..1, rotations quaternions xyzw; the coefficients of the bands are
+those of splat .ply files, sign for sign. A viewer without the extension shows points in ``COLOR_0``.
 """
 
 from __future__ import annotations
@@ -14,33 +14,32 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beags_plugin.core.densification import SH_C0
+from beags_plugin.core.sh import SH_C0
 from beags_plugin.core.surfels import Surfels, opacities
 from beags_plugin.export.base import Exporter
 from beags_plugin.export.glb import add_mesh
 from beags_plugin.export.gltf import FLOAT, UNSIGNED_BYTE, Document, glb_to_world, positions
 from beags_plugin.export.mesh import TexturedExporter
-from beags_plugin.export.splat_parts import SplatPart, splat_parts, thin_log_scales, without_invented, y_up_surfels
-from beags_plugin.splat_io.files import whole_file
-from beags_plugin.splat_io.ply import THICKNESS
+from beags_plugin.export.splat_parts import SplatPart, splat_parts, without_invented, y_up_surfels
+from beags_plugin.splat_io.files import write_bytes
+from beags_plugin.splat_io.ply import thin_log_scales
 from beags_plugin.surfaces.item import ExportItem
 
 EXTENSION = "KHR_gaussian_splatting"
 _POINTS = 0
-_FACTS = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}  # its projection and sorting are the defaults
+_FACTS = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}  # projection and sorting are the defaults
 
 
 @dataclass(frozen=True)
 class GltfSplatsExporter(Exporter):
-    """Splats as .glb: three.js, CesiumJS, and what else knows KHR_gaussian_splatting."""
+    """Splats as .glb: three.js, CesiumJS, and other programs that support KHR_gaussian_splatting."""
 
     suffix: ClassVar[str] = "splats.glb"
 
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
         document = Document()
         document.roots += [add_splats(document, part) for part in splat_parts(item)]
-        with whole_file(path) as unfinished:
-            unfinished.write_bytes(document.to_bytes())
+        write_bytes(path, document.to_bytes())
         return {"nodes": len(document.roots)}
 
     def to_world(self, path: Path, origin: Tensor) -> bool:
@@ -49,7 +48,7 @@ class GltfSplatsExporter(Exporter):
 
 @dataclass(frozen=True)
 class GltfBothExporter(TexturedExporter):
-    """An object's splats and its mesh in one .glb: a node with its name, and one for either below it."""
+    """An object's splats and its mesh in one .glb: a node with its name, and below it one for each."""
 
     suffix: ClassVar[str] = "both.glb"
     holds_gaussians: ClassVar[bool] = True
@@ -62,8 +61,7 @@ class GltfBothExporter(TexturedExporter):
         children = [add_splats(document, part, f"{part.name} splats") for part in splat_parts(item)]
         children.append(add_mesh(document, made.mesh, f"{item.name} mesh", texture, made.invented))
         document.roots.append(document.add("nodes", name=item.name, children=children))
-        with whole_file(path) as unfinished:
-            unfinished.write_bytes(document.to_bytes())
+        write_bytes(path, document.to_bytes())
         return made.facts() | {"texture": facts}
 
     def to_world(self, path: Path, origin: Tensor) -> bool:
@@ -71,15 +69,15 @@ class GltfBothExporter(TexturedExporter):
 
 
 def add_splats(document: Document, part: SplatPart, name: str = "") -> int:
-    """Append a node with the Gaussians of an object, called ``name`` or as the object is; return its number.
+    """Append a node with the Gaussians of an object, called ``name`` or as the object is; return its index.
 
-    They have z up and the file y: places, rotations and colours are turned.
+    They have z up and the file y: positions, rotations and colours are turned.
     """
     turned = y_up_surfels(part.surfels)
     floats = {
         "ROTATION": (torch.nn.functional.normalize(turned.quats.double(), dim=1)[:, [1, 2, 3, 0]], "VEC4"),
-        "SCALE": (thin_log_scales(turned, THICKNESS).exp(), "VEC3"),
-        "OPACITY": (opacities(turned.opacity_logits.double()).clamp(0.0, 1.0), "SCALAR"),
+        "SCALE": (thin_log_scales(turned.log_scales.detach().double()).exp(), "VEC3"),
+        "OPACITY": (opacities(turned.opacity_logits.double()), "SCALAR"),
         "SH_DEGREE_0_COEF_0": (turned.sh_dc, "VEC3"),
     }
     for degree in range(1, turned.sh_degree + 1):

@@ -12,42 +12,35 @@ from torch import Tensor
 from beags_plugin.export.base import Exporter
 from beags_plugin.export.glb import glb_bytes
 from beags_plugin.export.gltf import glb_to_world
-from beags_plugin.splat_io.files import whole_file
-from beags_plugin.surfaces.fusion import Mesh, decimated, without_small_parts
+from beags_plugin.splat_io.files import whole_file, write_bytes
+from beags_plugin.surfaces.fusion import Mesh, decimated
 from beags_plugin.surfaces.item import ExportItem
 from beags_plugin.surfaces.mesh_options import MeshOptions
-from beags_plugin.surfaces.meshing import MadeMesh, closed_surface, open3d_missing, placed_surface
+from beags_plugin.surfaces.meshing import MadeMesh, closed_mesh, open3d_missing, placed_surface
 from beags_plugin.surfaces.texture import Texture, textured
 
 FEWEST, MOST, PER_GAUSSIAN = 1000, 20_000, 20
-"""Triangles where no number of them was asked for."""
+"""Triangles by default: the fewest, the most, and the number per Gaussian."""
 
 
 @dataclass(frozen=True)
 class MeshExporter(MeshOptions, Exporter):
-    """The surface that the training views see of an item rendered alone, placed by the photos, if there are any.
+    """The surface that the training views see of an item rendered alone, aligned with the photos, if there are any.
 
-    All file types hold the same mesh.
+    All file types hold the same mesh. closes: whether the format needs a closed mesh.
     """
 
     needs_views: ClassVar[bool] = True
+    needs_photos: ClassVar[bool] = True
     holds_gaussians: ClassVar[bool] = False
     closes: ClassVar[bool] = False
-
-    @property
-    def needs_photos(self) -> bool:
-        return True
 
     @classmethod
     def unavailable(cls) -> str | None:
         return open3d_missing()
 
-    def mesh(self, item: ExportItem) -> Mesh:
-        """Return the mesh of ``item``, made once for each set of options; raise ``NothingToExport`` without a face."""
-        return self.made(item).mesh
-
     def made(self, item: ExportItem) -> MadeMesh:
-        """Return the mesh of ``item`` and what of it is invented; as ``mesh``."""
+        """Return the mesh of ``item``, made once for each set of options; raise ``NothingToExport`` without a face."""
         closing = item.close or self.closes
         key = ("mesh", closing, *astuple(self))
         if key not in item.shared:
@@ -56,20 +49,19 @@ class MeshExporter(MeshOptions, Exporter):
 
     def _made(self, item: ExportItem, closing: bool) -> MadeMesh:
         most = self.triangles or min(MOST, max(FEWEST, PER_GAUSSIAN * len(item.surfels)))
-        surface = placed_surface(item, self)
+        surface, pixels = placed_surface(item, self)
         if closing:
-            solid = closed_surface(item, surface.mesh)
-            mesh = decimated(without_small_parts(solid.mesh, self.smallest_part), most)
-            return MadeMesh(mesh, surface.pixels, solid.invented_at(mesh.vertices))
-        return MadeMesh(decimated(surface.mesh, most), surface.pixels)
+            solid = closed_mesh(item, surface, self.smallest_part, most)
+            return MadeMesh(solid.mesh, pixels, solid.invented)
+        return MadeMesh(decimated(surface, most), pixels)
 
 
 @dataclass(frozen=True)
 class TexturedExporter(MeshExporter):
-    """File types that have a texture; those of one item share it."""
+    """File types with a texture, which those of one item share."""
 
     def texture_of(self, mesh: Mesh, item: ExportItem) -> tuple[Texture | None, dict[str, Any] | str]:
-        """Return the texture and the manifest's entry about it, or None and why there is none."""
+        """Return the texture and the manifest's entry about it, or None and the reason why there is none."""
         if self.texture == "none":
             return None, "none"
         if item.photos is None:
@@ -95,8 +87,7 @@ class GlbExporter(TexturedExporter):
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
         made = self.made(item)
         texture, facts = self.texture_of(made.mesh, item)
-        with whole_file(path) as part:
-            part.write_bytes(glb_bytes(made.mesh, item.name, texture, made.invented))
+        write_bytes(path, glb_bytes(made.mesh, item.name, texture, made.invented))
         return made.facts() | {"texture": facts}
 
     def to_world(self, path: Path, origin: Tensor) -> bool:
@@ -105,7 +96,7 @@ class GlbExporter(TexturedExporter):
 
 @dataclass(frozen=True)
 class ObjExporter(MeshExporter):
-    """Wavefront .obj, a colour after each vertex's place, as MeshLab and Blender read it."""
+    """Wavefront .obj with a colour after each vertex's position, as MeshLab and Blender read it."""
 
     suffix: ClassVar[str] = "obj"
 

@@ -1,4 +1,4 @@
-"""Colours of an object for viewers whose colours do not change with the view, and a first view of it."""
+"""Colours of an object for viewers whose colours do not change with the view, and an initial view of it."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from beags_plugin.core.densification import SH_C0
+from beags_plugin.core.sh import SH_C0
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.surfaces.close_up import close_up
 from beags_plugin.surfaces.frames import bounding_box
 from beags_plugin.surfaces.item import Viewpoints
 
-_PIXELS = 256  # of the longer side of the pictures that weigh the views
+_PIXELS = 256  # longer side of the images that weigh the views
 
 
 @dataclass(frozen=True)
 class SeenColors:
-    """Surfels of degree 0, and where to look at them from.
+    """Surfels of degree 0, and a view of them.
 
-    surfels: N, each with its colour of the training views. eye: [3] the place of the training camera that shows most of
-    them. up: [3] the mean of the training cameras' upward directions, unit length.
+    surfels: N, each with its colour in the training views. eye: [3] the position of the training camera that shows most
+    of them. up: [3] the mean of the training cameras' upward directions, unit length.
     """
 
     surfels: Surfels
@@ -32,10 +32,10 @@ class SeenColors:
 
 
 def seen_colors(surfels: Surfels, views: Viewpoints, on_render: Callable[[int], None]) -> SeenColors:
-    """Return each surfel's mean colour in the training views, weighted by what it contributes to a close-up of each.
+    """Return each surfel's mean colour in the training views, weighted by its contributions to a close-up of each view.
 
-    The degree-0 coefficient alone is the mean over all directions, most of which no photo shows. A surfel that shows in
-    no view keeps it. surfels: N of one object. on_render: receives the number of views rendered.
+    The degree-0 coefficient alone is the mean over all directions, most of which no photo shows. A surfel that no view
+    shows keeps it. surfels: N of one object. on_render: receives the number of views rendered.
     """
     surfels = surfels.detach()
     low, high = bounding_box(surfels)
@@ -46,13 +46,13 @@ def seen_colors(surfels: Surfels, views: Viewpoints, on_render: Callable[[int], 
         inputs = surfel_inputs(surfels, near)
         everywhere = torch.zeros(near.height, near.width, dtype=torch.int32)
         with torch.no_grad():
-            seen = views.rasterizer.class_contributions(inputs, near, views.settings, everywhere, 1)
-        total += seen * inputs.colors
-        weights += seen
+            contributions = views.rasterizer.class_contributions(inputs, near, views.settings, everywhere, 1)
+        total += contributions * inputs.colors
+        weights += contributions
         rotation, shift = camera.viewmat[:3, :3].double(), camera.viewmat[:3, 3].double()
-        up -= rotation[1].cpu().numpy()  # y points down
-        if (shown := float(seen.sum())) > most:
-            eye, most = (-rotation.T @ shift).cpu().numpy(), shown
+        up -= rotation[1].cpu().numpy()  # y points down.
+        if (covered := float(contributions.sum())) > most:
+            eye, most = (-rotation.T @ shift).cpu().numpy(), covered
         on_render(done)
     colors = torch.where(weights > 0, total / weights.clamp_min(1e-12), 0.5 + SH_C0 * surfels.sh_dc)
     fixed = replace(surfels, sh_dc=(colors - 0.5) / SH_C0, sh_rest=surfels.sh_rest[:, :0])

@@ -1,4 +1,4 @@
-"""Tables of few values for many: numbers, and the higher bands of Gaussians.
+"""Quantise many values to tables of few: numbers, and the higher bands of Gaussians.
 
 Determinism: everything runs on one thread, from a fixed start.
 """
@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-_ROUNDS = 30  # of Lloyd's algorithm on numbers; more change the fourth digit of the error
+_ROUNDS = 30  # rounds of Lloyd's algorithm on numbers; more change the fourth digit of the error
 _BINS = 4096
-_ALL = 1024  # Gaussians up to which each has an entry of its own
-_SHARE = 4  # Gaussians for an entry of the palette beyond
-_MOST = 65536  # entries that two bytes tell apart
+_ALL = 1024  # number of Gaussians up to which each has an entry of its own
+_SHARE = 4  # Gaussians per palette entry above that number
+_MOST = 65536  # entries that two bytes can index
 _BATCH = 8192
 _PASSES = 10
 
@@ -19,14 +19,15 @@ _PASSES = 10
 def table_of(values: np.ndarray, count: int) -> np.ndarray:
     """Return ``count`` numbers in ascending order, float32 precision, that stand for values [M] (k-means by Lloyd).
 
-    Fewer distinct values are kept as they are, the last of them repeated.
+    Fewer distinct values are kept, the last of them repeated.
     """
     distinct = np.unique(values.astype(np.float32))
     if len(distinct) <= count:
         return np.concatenate([distinct, np.repeat(distinct[-1:], count - len(distinct))])
     ordered = np.sort(values)
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
-    # Start: many entries of the best table lie as densely as the cube root of the values' density (Panter and Dite).
+    # The start: the entries of a large optimal table are as dense as the cube root of the values' density (Panter and
+    # Dite).
     members, edges = np.histogram(ordered, _BINS)
     shares = np.concatenate([[0.0], np.cumsum(np.cbrt(members))])
     table = np.interp((np.arange(count) + 0.5) / count, shares / shares[-1], edges)
@@ -38,7 +39,7 @@ def table_of(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def nearest(table: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the places of values of any shape in an ascending table."""
+    """Return the indices of the entries of an ascending table that are nearest to values of any shape."""
     middles = (table[1:].astype(np.float64) + table[:-1]) / 2
     return np.searchsorted(middles, values)
 

@@ -1,4 +1,4 @@
-"""Options of where exported objects stand and how large they are, and what their texts mean."""
+"""Options of the pose and size of exported objects, and the parsing of their texts."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _POINT = rf"(?:[^\s:][^:]*:{_NUMBER},{_NUMBER}|{_NUMBER},{_NUMBER},{_NUMBER})"
 _LENGTH = rf"({_NUMBER})\s*({'|'.join(METRES)})"
 _SCALE = re.compile(rf"\s*({_POINT})\s+({_POINT})\s+{_LENGTH}\s*")
-_DIGITS = 4  # after the first one of the distance between two points, of their coordinates
+_DIGITS = 4  # digits of two points' coordinates, counted from the first one of their distance
 
 
 @dataclass(frozen=True)
 class PhotoPoint:
-    """A pixel of a photo: its view's name, and x to the right and y down from the middle of the first pixel."""
+    """A pixel of a photo: its view's name, and x to the right and y down from the centre of the first pixel."""
 
     view: str
     x: float
@@ -27,7 +27,7 @@ class PhotoPoint:
 
 
 Point = PhotoPoint | tuple[float, float, float]
-"""A place that a photo shows, or coordinates in the input's world."""
+"""A point that a photo shows, or coordinates in the input's world."""
 
 
 @dataclass(frozen=True)
@@ -41,15 +41,15 @@ class KnownLength:
 
 @dataclass(frozen=True)
 class PoseOptions:
-    """Options of where objects stand and how large they are."""
+    """Options of the pose and size of exported objects."""
 
     up: str = ""
-    """Turn objects so that z is up: plane, at right angles to the plane that each stands on; or the direction x,y,z of
-    the input's world that shall be up."""
+    """Turn objects so that z is up: plane, up is normal to the plane that each stands on; or x,y,z, the direction of
+    the input's world that is up."""
     centre: bool = False
-    """Put the origin under the middle of each object, where it stands."""
+    """Put the origin at the foot of each object, under its middle."""
     scale_by: str = ""
-    """Give files a size: "A B 12 cm", two points and the length between them in mm, cm, m, in or ft. A point is a
+    """Scale files to a known length: "A B 12 cm", two points and their distance in mm, cm, m, in or ft. A point is a
     photo's pixel, frame_0012:340,215, or x,y,z of the input's world."""
 
     def __post_init__(self) -> None:
@@ -84,16 +84,16 @@ class PoseOptions:
 
 
 def check_length(text: str) -> tuple[str, str]:
-    """Return number and unit of a text such as 12 cm; raises ``UserError`` for another one."""
+    """Return the number and unit of a text such as 12 cm; raises ``UserError`` for another text."""
     match = re.fullmatch(rf"\s*{_LENGTH}\s*", text)
     if match is None or not 0 < float(match[1]) * METRES[match[2]] < math.inf:
-        *some, last = METRES
-        raise UserError(f"{text.strip()!r} is no length: give one such as 12 cm, in {', '.join(some)} or {last}.")
+        *others, last = METRES
+        raise UserError(f"{text.strip()!r} is no length: give one such as 12 cm, in {', '.join(others)} or {last}.")
     return match[1], match[2]
 
 
 def scale_by_text(first: Sequence[float], second: Sequence[float], length: str) -> str:
-    """Return the text of ``scale_by`` for two places [3] of the input's world that are apart.
+    """Return the text of ``scale_by`` for two distinct points [3] of the input's world.
 
     length: such as 12 cm. Raises ``UserError`` for another text.
     """

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from beags_plugin.export.mesh import MeshExporter
-from beags_plugin.splat_io.files import whole_file
+from beags_plugin.splat_io.files import write_bytes
 from beags_plugin.surfaces.item import ExportItem
 
-MILLIMETRES = 1000.0  # in a metre
+MILLIMETRES = 1000.0  # millimetres per metre
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class PrintExporter(MeshExporter):
             import networkx  # noqa: F401
             import trimesh  # noqa: F401
         except ImportError as error:
-            return f"trimesh or what it needs cannot be loaded ({error}); pip install trimesh lxml networkx."
+            return f"trimesh or a library it needs cannot be loaded ({error}); pip install trimesh lxml networkx."
         return super().unavailable()
 
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
@@ -41,20 +41,19 @@ class PrintExporter(MeshExporter):
         made = self.made(item)
         solid = trimesh.Trimesh(MILLIMETRES * made.mesh.vertices, made.mesh.faces, process=False)
         content: Any = trimesh.Scene({item.name: solid}).export(file_type=self.suffix)
-        with whole_file(path) as part:
-            part.write_bytes(self.repeatable(content))
+        write_bytes(path, self.repeatable(content))
         sides = solid.extents.round(2).tolist()
         return made.facts() | {"unit": "millimetre", "sides": sides, "watertight": bool(solid.is_watertight)}
 
     @classmethod
     def repeatable(cls, content: bytes) -> bytes:
-        """Return the file's content without what trimesh draws by chance."""
+        """Return the file's content with trimesh's random parts replaced."""
         return content
 
 
 @dataclass(frozen=True)
 class StlExporter(PrintExporter):
-    """Binary .stl, which states no unit; slicers take millimetres."""
+    """Binary .stl, which states no unit; slicers assume millimetres."""
 
     suffix: ClassVar[str] = "stl"
 
@@ -67,7 +66,7 @@ class ThreeMfExporter(PrintExporter):
 
     @classmethod
     def repeatable(cls, content: bytes) -> bytes:
-        """Return the archive with UUIDs that follow from its content, in place of trimesh's random ones."""
+        """Return the archive with UUIDs that follow from its content instead of trimesh's random ones."""
         made = io.BytesIO()
         with zipfile.ZipFile(io.BytesIO(content)) as read, zipfile.ZipFile(made, "w") as written:
             for entry in read.infolist():
@@ -76,8 +75,8 @@ class ThreeMfExporter(PrintExporter):
 
 
 def _with_own_uuids(text: bytes) -> bytes:
-    """Return XML whose n-th UUID is made of the rest of the text and n."""
+    """Return XML whose n-th UUID is a hash of n and the rest of the text."""
     first, *others = re.split(rb'(?<=:UUID=")[0-9a-f-]{36}(?=")', text)
     rest = hashlib.sha256(b"".join([first, *others])).hexdigest()
-    own = (str(uuid.uuid5(uuid.NAMESPACE_OID, f"{rest} {order}")).encode() for order in range(len(others)))
-    return first + b"".join(mine + other for mine, other in zip(own, others, strict=True))
+    uuids = (str(uuid.uuid5(uuid.NAMESPACE_OID, f"{rest} {order}")).encode() for order in range(len(others)))
+    return first + b"".join(own + other for own, other in zip(uuids, others, strict=True))

@@ -1,8 +1,7 @@
-"""The objects of an export item, for files that hold them one beside the other."""
+"""The objects of an export item, for files that hold several objects."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -25,28 +24,25 @@ class SplatPart:
 
 
 def splat_parts(item: ExportItem) -> list[SplatPart]:
-    """Return the finite Gaussians of an item by their classes; raises ``NothingToExport`` if there is none.
+    """Return the finite Gaussians of an item by class; raises ``NothingToExport`` if there is none.
 
-    The only class of an item is called as the item is, others as ``class_names`` says.
+    The only class of an item has the item's name, others have those of ``class_names``.
     """
-    parts = list(_parts(item))
-    if not parts:
-        raise NothingToExport(f"{item.name} has no finite Gaussian, so there is nothing to write.")
-    return parts
-
-
-def _parts(item: ExportItem) -> Iterator[SplatPart]:
     finite = finite_mask(item.surfels)
     present = item.class_ids[finite].unique().tolist()
+    if not present:
+        raise NothingToExport(f"{item.name} has no finite Gaussian, so there is nothing to write.")
+    parts = []
     for class_id in present:
         chosen = finite & (item.class_ids == class_id)
         name = item.name if len(present) == 1 else item.class_names.get(class_id, f"class {class_id}")
         invented = None if item.invented is None else item.invented[chosen]
-        yield SplatPart(name, class_id, item.surfels[chosen].detach(), invented)
+        parts.append(SplatPart(name, class_id, item.surfels[chosen].detach(), invented))
+    return parts
 
 
 def without_invented(item: ExportItem) -> ExportItem:
-    """Return an item without the Gaussians that close it, as a mesh of its surface needs it."""
+    """Return an item without the Gaussians that close it, for a mesh of its surface."""
     if item.invented is None:
         return item
     own = ~item.invented
@@ -54,13 +50,6 @@ def without_invented(item: ExportItem) -> ExportItem:
 
 
 def y_up_surfels(surfels: Surfels) -> Surfels:
-    """Return surfels of a frame with z up in one with y up; z of ours is its y, and y its -z."""
+    """Return surfels of a frame with z up in one with y up: z becomes y, and y becomes -z."""
     quarter = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]]
     return from_input_frame(surfels, torch.tensor(quarter, dtype=torch.float64), 1.0)
-
-
-def thin_log_scales(surfels: Surfels, thickness: float) -> Tensor:
-    """Return [N, 3] logs of scales, the third ``thickness`` times the smaller of the two."""
-    log_scales = surfels.log_scales.detach().double()
-    third = log_scales.amin(dim=1, keepdim=True) + torch.log(torch.tensor(thickness, dtype=torch.float64))
-    return torch.cat([log_scales, third], dim=1)

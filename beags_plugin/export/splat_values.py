@@ -1,4 +1,4 @@
-"""Gaussians as compressed files for viewers of 3D Gaussians take them: finite, and neighbours side by side."""
+"""Gaussians prepared for compressed files: finite, as 3D Gaussians, with neighbours side by side."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 import torch
 
 from beags_plugin.core.surfels import Surfels, opacities
-from beags_plugin.splat_io.ply import THICKNESS
+from beags_plugin.splat_io.ply import thin_log_scales
 from beags_plugin.surfaces.item import NothingToExport
 
-_LEAST_LOG_SCALE = -20.0  # 2e-9 units: a stray that is thinner would only make its neighbours' steps coarser
-_MORTON_BITS = 21  # of each axis: three times as many fill 63 bits
+_LEAST_LOG_SCALE = -20.0  # 2e-9 units; thinner strays would only make the steps of their neighbours coarser
+_MORTON_BITS = 21  # bits per axis: three axes fill 63 bits
 
 
 @dataclass(frozen=True)
@@ -36,28 +36,21 @@ class SplatValues:
 
 
 def finite_mask(surfels: Surfels) -> torch.Tensor:
-    """Return [N] bool, the surfels of which every parameter is finite."""
+    """Return [N] bool, the surfels whose parameters are all finite."""
     values = (surfels.means, surfels.quats, surfels.log_scales, surfels.sh)
     finite = torch.cat([value.detach().flatten(1) for value in values], dim=1).isfinite().all(dim=1)
     return finite & surfels.opacity_logits.isfinite()
 
 
-def finite_surfels(surfels: Surfels) -> Surfels:
-    """Return the surfels without those of which a parameter is not finite."""
-    return surfels[finite_mask(surfels)]
-
-
 def splat_values(surfels: Surfels, name: str) -> SplatValues:
     """Return the Gaussians of the object called ``name``; raise ``NothingToExport`` if none of them is finite."""
-    surfels = finite_surfels(surfels)
+    surfels = surfels[finite_mask(surfels)]
     if len(surfels) == 0:
         raise NothingToExport(f"{name} has no finite Gaussian, so there is nothing to write.")
-    log_scales = surfels.log_scales.detach().double()
-    thin = log_scales.amin(dim=1, keepdim=True) + math.log(THICKNESS)
     values = (
         surfels.means.detach().double(),
         torch.nn.functional.normalize(surfels.quats.detach().double(), dim=1),
-        torch.cat([log_scales, thin], dim=1).clamp_min(_LEAST_LOG_SCALE),
+        thin_log_scales(surfels.log_scales.detach().double()).clamp_min(_LEAST_LOG_SCALE),
         opacities(surfels.opacity_logits.detach().double()),
         surfels.sh_dc.detach().double(),
         surfels.sh_rest.detach().double(),
@@ -80,10 +73,10 @@ def morton_order(points: np.ndarray) -> np.ndarray:
 
 
 def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Leave out the component of each unit quaternion that is largest in size, made positive, as q and -q turn alike.
+    """Drop the component of each unit quaternion that is largest in size; its sign is made positive, since q equals -q.
 
-    quats: [N, 4] wxyz. Returns (the place of the largest [N] 0..3, the others in their order [N, 3], each times
-    sqrt(2) and so within -1..1).
+    quats: [N, 4] wxyz. Returns the index of the largest, [N] 0..3, and the others in their order, [N, 3], times sqrt(2)
+    and so within -1..1.
     """
     largest = np.abs(quats).argmax(axis=1)
     rows = np.arange(len(quats))

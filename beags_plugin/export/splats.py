@@ -8,10 +8,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from beags_plugin.core.densification import SH_C0
+from beags_plugin.core.sh import SH_C0
 from beags_plugin.export.base import Exporter
 from beags_plugin.export.splat_values import splat_values
-from beags_plugin.splat_io.files import whole_file
+from beags_plugin.splat_io.files import write_bytes
 from beags_plugin.splat_io.ply import write_ply
 from beags_plugin.surfaces.item import ExportItem
 
@@ -44,8 +44,8 @@ class SurfelPlyExporter(Exporter):
 class SplatExporter(Exporter):
     """The .splat of antimatter15's viewer: 32 bytes a Gaussian, the largest and most opaque first, as it sorts them.
 
-    Colours do not change with the view, rotations have 8 bits, so that thin discs are tilted by up to a degree, and
-    there are no class ids.
+    Colours do not change with the view; rotations have 8 bits, which tilts thin discs by up to a degree; there are no
+    class ids.
     """
 
     suffix: ClassVar[str] = "splat"
@@ -57,8 +57,7 @@ class SplatExporter(Exporter):
         rows = np.empty(len(values), _ROW)
         rows["mean"], rows["scale"] = values.means[order], np.exp(values.log_scales[order])
         colors = np.column_stack([0.5 + SH_C0 * values.sh_dc, values.opacities])[order]
-        rows["color"] = np.rint(255.0 * colors).clip([0, 0, 0, 1], [255, 255, 255, 254])  # 255 is an infinite logit
+        rows["color"] = np.rint(255.0 * colors).clip([0, 0, 0, 1], [255, 255, 255, 254])  # 255: an infinite logit
         rows["quat"] = np.rint(128.0 * values.quats[order] + 128.0).clip(0, 255)
-        with whole_file(path) as part:
-            part.write_bytes(rows.tobytes())
+        write_bytes(path, rows.tobytes())
         return {}

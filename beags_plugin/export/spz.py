@@ -8,7 +8,6 @@ Version 3 is gzip of a header of 16 bytes and the parts; version 4 a header of 3
 from __future__ import annotations
 
 import gzip
-import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,31 +19,31 @@ import torch
 
 from beags_plugin.core.surfels import Surfels, opacities
 from beags_plugin.export.base import Exporter
-from beags_plugin.export.splat_values import finite_surfels, smallest_three
-from beags_plugin.splat_io.files import whole_file
+from beags_plugin.export.splat_values import finite_mask, smallest_three
+from beags_plugin.splat_io.files import write_bytes
 from beags_plugin.splat_io.frames import to_input_frame
-from beags_plugin.splat_io.ply import THICKNESS
+from beags_plugin.splat_io.ply import thin_log_scales
 from beags_plugin.surfaces.item import ExportItem
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.zstd import zstandard
 
 MAGIC = 0x5053474E
 VERSIONS = (3, 4)
-_HEADER = 32  # bytes of version 4's
-_EFFORT = 12  # of zstd, of 22: more takes much longer for a percent
+_HEADER = 32  # bytes of the header of version 4
+_EFFORT = 12  # zstd's level, of 22; higher ones take much longer for one percent
 _MOST = 2**23 - 1  # a signed 24-bit number
-_COLOR_SCALE = 0.15  # the format's: bytes hold 0.5 + 0.15 dc, so that colours a little out of range survive
+_COLOR_SCALE = 0.15  # the format's factor: bytes hold 0.5 + 0.15 dc, so that colours slightly out of range survive
 
 
 @dataclass(frozen=True)
 class SpzExporter(Exporter):
-    """Niantic's .spz: Scaniverse, SuperSplat, Babylon.js. It has no place for class ids.
+    """Niantic's .spz: Scaniverse, SuperSplat, Babylon.js. It cannot hold class ids.
 
     Like the tools that make .spz of .ply, it turns the axes of splat .ply files (y down, z forward) to the format's own
     (y up, z backward), half a turn about x; readers turn them back.
 
-    version: 3, which most readers know, or 4, a little smaller, for which zstandard is needed. first_band_bits,
-    other_bands_bits: of the SH degrees; fewer compress better.
+    version: 3, which most readers support, or 4, which is slightly smaller and needs zstandard. first_band_bits,
+    other_bands_bits: bits of the coefficients of degree 1 and above; fewer compress better.
     """
 
     suffix: ClassVar[str] = "spz"
@@ -65,37 +64,34 @@ class SpzExporter(Exporter):
             content = _streams(count, degree, bits, [part for part in parts if part or not count])
         else:
             header = struct.pack("<IIIBBBB", MAGIC, self.version, count, degree, bits, 0, 0)
-            content = gzip.compress(b"".join([header, *parts]), mtime=0)  # the same bytes at any time
-        with whole_file(path) as part:
-            part.write_bytes(content)
+            content = gzip.compress(b"".join([header, *parts]), mtime=0)  # The time would change the bytes.
+        write_bytes(path, content)
         return {"version": self.version, "fractional_bits": bits, "sh_degree": degree}
 
     def _parts(self, surfels: Surfels) -> tuple[int, int, int, list[bytes]]:
         """Return the number of Gaussians, the bits after the point, the degree, and the six parts."""
         half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0, 0.0], dtype=torch.float64))[:3]
-        # Of a disc's own axes two are turned too, which leaves it as it is: so do those tools, and the .ply comes back.
+        # Like those tools, reverse two axes of each disc too, which does not change it, so that the .ply comes back.
         quats = surfels.quats.detach() * surfels.quats.new_tensor([1.0, 1.0, -1.0, -1.0])
         turned = replace(to_input_frame(surfels, half_turn, 1.0), quats=quats)
-        turned = finite_surfels(turned)
+        turned = turned[finite_mask(turned)]
         means = turned.means.double().cpu().numpy()
         bits = fractional_bits(float(np.abs(means).max(initial=0.0)))
         fixed = np.round(means * 2.0**bits).astype("<i4")
-        log_scales = turned.log_scales.double()
-        thin = log_scales.amin(dim=1, keepdim=True) + math.log(THICKNESS)
         degree = turned.sh_degree
         parts = [
             np.ascontiguousarray(fixed).view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
-            # 0 and 255 would be read as infinite logits; renderers skip what 1 shows, and cap alphas at 0.99
+            # Readers would take 0 and 255 as infinite logits; renderers skip alphas of 1/255 and cap those above 0.99.
             _bytes(255.0 * opacities(turned.opacity_logits.double()), 1, 254),
             _bytes(255.0 * (0.5 + _COLOR_SCALE * turned.sh_dc.double())),
-            _bytes(16.0 * (torch.cat([log_scales, thin], dim=1) + 10.0)),
+            _bytes(16.0 * (thin_log_scales(turned.log_scales.double()) + 10.0)),
             _rotation_bytes(turned.quats.double()),
             self._sh_bytes(turned.sh_rest.double()),
         ]
         return len(turned), bits, degree, parts
 
     def _sh_bytes(self, rest: torch.Tensor) -> bytes:
-        """Encode coefficients -1..1 as 0..255 with 0 at 128, rounded to the bits wanted; colour is the inner axis."""
+        """Encode coefficients -1..1 as 0..255 with 0 at 128, rounded to the bits of their band; colours innermost."""
         bits = torch.full((rest.shape[1], 1), float(self.other_bands_bits), dtype=rest.dtype)
         bits[:3] = self.first_band_bits
         step = 2.0 ** (8.0 - bits)
@@ -103,7 +99,7 @@ class SpzExporter(Exporter):
 
 
 def fractional_bits(reach: float) -> int:
-    """Return the most bits after the point, 0..23, for coordinates up to ``reach``; raise ``UserError`` if none fit."""
+    """Return the most fractional bits, 0..23, for coordinates up to ``reach``; raise ``UserError`` if none fit."""
     if reach > _MOST:
         raise UserError(f"the scene reaches {reach:.3g} units from the origin, but .spz holds {_MOST}: scale it down.")
     bits = 23
@@ -113,13 +109,13 @@ def fractional_bits(reach: float) -> int:
 
 
 def _rotation_bytes(quats: torch.Tensor) -> bytes:
-    """Encode unit quaternions as 32 bits: the largest component's place, then sign and 9 bits of each other.
+    """Encode unit quaternions as 32 bits: the index of the largest component, then sign and 9 bits of each other.
 
     The order is xyzw, the first in the highest bits. The largest is made positive and follows from the length, and the
     others are at most sqrt(1/2).
     """
     unit = torch.nn.functional.normalize(quats, dim=1).cpu().numpy()[:, [1, 2, 3, 0]]
-    largest, others = smallest_three(unit)  # times sqrt(2): at most 1
+    largest, others = smallest_three(unit)
     words = largest.astype(np.uint32)
     for value in others.T:
         size = np.rint(511.0 * np.abs(value)).clip(0, 511).astype(np.uint32)

@@ -1,7 +1,7 @@
 """Gaussians as USD, by the schemas of OpenUSD 26.03 (UsdVol, ParticleField): a prim for each object under one root.
 
-Pixar's library writes it. Scales are lengths and opacities 0..1, as the schemas say; the coefficients of the bands are
-those of splat .ply files. An object that is closed has its closed mesh beside its splats, as a collider.
+Pixar's library writes it. Scales are lengths and opacities 0..1, as the schemas demand; the coefficients of the bands
+are those of splat .ply files. A closed object has its closed mesh beside its splats, as a collider.
 """
 
 from __future__ import annotations
@@ -18,25 +18,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beags_plugin.core.densification import SH_C0
-from beags_plugin.core.surfels import Surfels, opacities
+from beags_plugin.core.sh import SH_C0
+from beags_plugin.core.surfels import opacities
 from beags_plugin.export.base import Exporter
 from beags_plugin.export.gltf import y_up
 from beags_plugin.export.mesh import MOST
-from beags_plugin.export.splat_parts import SplatPart, splat_parts, thin_log_scales, without_invented, y_up_surfels
+from beags_plugin.export.splat_parts import SplatPart, splat_parts, without_invented, y_up_surfels
 from beags_plugin.export.usdz import define_mesh, modules, packed
-from beags_plugin.splat_io.files import whole_file
-from beags_plugin.splat_io.ply import THICKNESS
+from beags_plugin.splat_io.files import write_bytes
+from beags_plugin.splat_io.ply import thin_log_scales
 from beags_plugin.surfaces.closing import Closed
 from beags_plugin.surfaces.color import linear_from_srgb
-from beags_plugin.surfaces.fusion import decimated, without_small_parts
 from beags_plugin.surfaces.item import ExportItem, NothingToExport
 from beags_plugin.surfaces.mesh_options import MeshOptions
-from beags_plugin.surfaces.meshing import closed_surface, placed_surface
+from beags_plugin.surfaces.meshing import closed_mesh, placed_surface
 from beags_plugin.system.errors import check_choice
 
 ROOT = "/Scene"
-_REACH = 3.0  # standard deviations that count for the extent
+_REACH = 3.0  # standard deviations that the extent covers
 _SURFLET_APIS = ("PositionAttribute", "OrientationAttribute", "ScaleAttribute", "OpacityAttribute")
 _SURFLET_APIS += ("KernelGaussianSurflet", "SphericalHarmonicsAttribute")
 
@@ -45,10 +44,11 @@ _SURFLET_APIS += ("KernelGaussianSurflet", "SphericalHarmonicsAttribute")
 class UsdSplatsExporter(Exporter):
     """USD of splats, as a package or as text.
 
-    kernel: "ellipsoid", thin 3D Gaussians, or "surflet", discs that nothing off their plane shows. up_axis: "y" or "z".
-    mesh: how the surface of a collider is made.
+    kernel: "ellipsoid", thin 3D Gaussians, or "surflet", discs that are invisible from the side. up_axis: "y" or "z".
+    mesh: how the surface of a collider is made. layer: the name of the layer in the file.
     """
 
+    layer: ClassVar[str]
     kernel: str = "ellipsoid"
     up_axis: str = "y"
     mesh: MeshOptions = MeshOptions()
@@ -64,7 +64,7 @@ class UsdSplatsExporter(Exporter):
         except ImportError as error:
             return f"Pixar's USD library cannot be loaded ({error}); pip install 'usd-core>=26.3'."
         if not hasattr(volumes, "ParticleField3DGaussianSplat"):
-            return "Pixar's USD library is older than 26.3 and knows no splats; pip install 'usd-core>=26.3'."
+            return "Pixar's USD library is older than 26.3 and has no splats; pip install 'usd-core>=26.3'."
         return None
 
     def _write_layer(self, layer: Path, item: ExportItem) -> dict[str, Any]:
@@ -91,13 +91,13 @@ class UsdSplatsExporter(Exporter):
     def _define_splats(self, stage: Any, place: str, part: SplatPart) -> None:
         Gf, Sdf, UsdGeom, Vt = modules("Gf", "Sdf", "UsdGeom", "Vt")
         surfels = y_up_surfels(part.surfels) if self.up_axis == "y" else part.surfels
-        scales = _floats(thin_log_scales(surfels, THICKNESS).exp())
+        scales = _floats(thin_log_scales(surfels.log_scales.detach().double()).exp())
         prim = self._field(stage, place)
-        quats = torch.nn.functional.normalize(surfels.quats.double(), dim=1)[:, [1, 2, 3, 0]]  # real part last
+        quats = torch.nn.functional.normalize(surfels.quats.double(), dim=1)[:, [1, 2, 3, 0]]  # The real part is last.
         prim.GetAttribute("positions").Set(Vt.Vec3fArray.FromNumpy(_floats(surfels.means)))
         prim.GetAttribute("orientations").Set(Vt.QuatfArray.FromNumpy(_floats(quats)))
         prim.GetAttribute("scales").Set(Vt.Vec3fArray.FromNumpy(scales))
-        prim.GetAttribute("opacities").Set(Vt.FloatArray.FromNumpy(_floats(_shares(surfels))))
+        prim.GetAttribute("opacities").Set(Vt.FloatArray.FromNumpy(_floats(opacities(surfels.opacity_logits.double()))))
         prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(surfels.sh_degree)
         coefficients = _floats(surfels.sh.reshape(-1, 3))
         prim.GetAttribute("radiance:sphericalHarmonicsCoefficients").Set(Vt.Vec3fArray.FromNumpy(coefficients))
@@ -108,14 +108,14 @@ class UsdSplatsExporter(Exporter):
         primvars, kinds = UsdGeom.PrimvarsAPI(prim), Sdf.ValueTypeNames
         primvars.CreatePrimvar("class_id", kinds.Int, UsdGeom.Tokens.constant).Set(part.class_id)
         colors = linear_from_srgb(_floats((surfels.sh_dc * SH_C0 + 0.5).clamp(0.0, 1.0))).astype(np.float32)
-        shown = primvars.CreatePrimvar("displayColor", kinds.Color3fArray, UsdGeom.Tokens.vertex)
-        shown.Set(Vt.Vec3fArray.FromNumpy(colors))
+        display = primvars.CreatePrimvar("displayColor", kinds.Color3fArray, UsdGeom.Tokens.vertex)
+        display.Set(Vt.Vec3fArray.FromNumpy(colors))
         if part.invented is not None:
             marks = Vt.FloatArray.FromNumpy(_floats(part.invented))
             primvars.CreatePrimvar("invented", kinds.FloatArray, UsdGeom.Tokens.vertex).Set(marks)
 
     def _field(self, stage: Any, place: str) -> Any:
-        """Return a new prim with the attributes of splats."""
+        """Define a prim with the attributes of splats, and return it."""
         if self.kernel == "ellipsoid":
             return stage.DefinePrim(place, "ParticleField3DGaussianSplat")
         prim = stage.DefinePrim(place, "ParticleField")
@@ -124,7 +124,7 @@ class UsdSplatsExporter(Exporter):
         return prim
 
     def _define_collider(self, stage: Any, place: str, collider: Closed) -> None:
-        """Add a mesh that collides and is not drawn; it may move, so that its parts are made convex."""
+        """Add an invisible mesh for collisions; physics engines split it into convex parts, so that it may move."""
         UsdGeom, UsdPhysics = modules("UsdGeom", "UsdPhysics")
         mesh = collider.mesh
         vertices = y_up(mesh.vertices) if self.up_axis == "y" else mesh.vertices
@@ -146,27 +146,22 @@ class UsdSplatsExporter(Exporter):
             )
             stage.GetRootLayer().Save()
             del stage, root
-            content = self._content(layer)
-        with whole_file(path) as part:
-            part.write_bytes(content)
+            write_bytes(path, self._content(layer))
         return True
 
     @abstractmethod
     def _unpacked(self, path: Path, folder: Path) -> Path:
-        """Return the layer of a file of ours, which lies in ``folder`` then."""
+        """Extract the layer of a file that ``write`` made into ``folder``; return its path."""
 
     @abstractmethod
     def _content(self, layer: Path) -> bytes:
         """Return the content of the file that holds a layer."""
 
-    def _write_whole(self, path: Path, item: ExportItem, name: str) -> dict[str, Any]:
-        """Write to ``path`` what holds a layer called ``name``; return its facts."""
+    def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
         with tempfile.TemporaryDirectory() as folder:
-            layer = Path(folder) / name
+            layer = Path(folder) / self.layer
             facts = self._write_layer(layer, item)
-            content = self._content(layer)
-        with whole_file(path) as part:
-            part.write_bytes(content)
+            write_bytes(path, self._content(layer))
         return facts
 
 
@@ -175,13 +170,11 @@ class UsdzSplatsExporter(UsdSplatsExporter):
     """A package: Quick Look and RealityKit since version 27, Isaac Sim 6, Houdini."""
 
     suffix: ClassVar[str] = "splats.usdz"
-
-    def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
-        return self._write_whole(path, item, "splats.usdc")
+    layer: ClassVar[str] = "splats.usdc"
 
     def _unpacked(self, path: Path, folder: Path) -> Path:
         with zipfile.ZipFile(path) as package:
-            return Path(package.extract("splats.usdc", folder))
+            return Path(package.extract(self.layer, folder))
 
     def _content(self, layer: Path) -> bytes:
         return packed(layer)
@@ -189,31 +182,27 @@ class UsdzSplatsExporter(UsdSplatsExporter):
 
 @dataclass(frozen=True)
 class UsdaSplatsExporter(UsdSplatsExporter):
-    """Text, to look at and to compose."""
+    """Text, to read and to compose."""
 
     suffix: ClassVar[str] = "splats.usda"
-
-    def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
-        return self._write_whole(path, item, "splats.usda")
+    layer: ClassVar[str] = "splats.usda"
 
     def _unpacked(self, path: Path, folder: Path) -> Path:
-        return Path(shutil.copyfile(path, folder / "splats.usda"))
+        return Path(shutil.copyfile(path, folder / self.layer))
 
     def _content(self, layer: Path) -> bytes:
         return layer.read_bytes()
 
 
 def _collider(item: ExportItem, options: MeshOptions) -> tuple[Closed | None, str]:
-    """Return the closed surface of an item that shall be closed, with few triangles, or None and why there is none."""
+    """Return the closed mesh of an item to be closed, with few triangles, or None and the reason why there is none."""
     if not item.close or item.views is None:
         return None, ""
     own = without_invented(item)
     try:
-        surface = closed_surface(own, placed_surface(own, options).mesh)
+        return closed_mesh(own, placed_surface(own, options)[0], options.smallest_part, MOST), ""
     except NothingToExport as error:
         return None, f"none, as {str(error).partition(':')[0]}"
-    mesh = decimated(without_small_parts(surface.mesh, options.smallest_part), MOST)
-    return Closed(mesh, surface.invented_at(mesh.vertices)), ""
 
 
 def _named_child(stage: Any, name: str) -> str:
@@ -226,10 +215,6 @@ def _named_child(stage: Any, name: str) -> str:
         word = f"{plain}_{number}"
     UsdGeom.Xform.Define(stage, f"{ROOT}/{word}").GetPrim().SetDisplayName(name)
     return f"{ROOT}/{word}"
-
-
-def _shares(surfels: Surfels) -> Tensor:
-    return opacities(surfels.opacity_logits.double()).clamp(0.0, 1.0)
 
 
 def _floats(values: Tensor) -> np.ndarray:

@@ -1,7 +1,7 @@
 """A mesh as .usdz, for Apple's devices and programs that read USD; Pixar's library writes it.
 
-The content is that of a .glb: y up, normals, a texture or colours of the vertices, and no light of its own: what the
-photos show is emitted (UsdPreviewSurface has no unlit material).
+The content is that of a .glb: y up, normals, and a texture or colours of the vertices. UsdPreviewSurface has no unlit
+material, so the mesh emits the photos' colours.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from beags_plugin.export.glb import png_bytes
 from beags_plugin.export.gltf import y_up
 from beags_plugin.export.mesh import TexturedExporter
-from beags_plugin.splat_io.files import whole_file
+from beags_plugin.splat_io.files import write_bytes
 from beags_plugin.surfaces.color import linear_from_srgb
 from beags_plugin.surfaces.fusion import Mesh
 from beags_plugin.surfaces.item import ExportItem
@@ -26,7 +26,7 @@ from beags_plugin.surfaces.surface import vertex_normals
 from beags_plugin.surfaces.texture import Texture
 
 _PICTURE = "colors.png"
-_LONG_AGO = 631152000  # 1990, in seconds since 1970; a package cannot say less than 1980
+_LONG_AGO = 631152000  # 1990, in seconds since 1970; a package cannot hold times before 1980
 
 
 @dataclass(frozen=True)
@@ -47,18 +47,16 @@ class UsdzExporter(TexturedExporter):
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
         made = self.made(item)
         texture, facts = self.texture_of(made.mesh, item)
-        content = usdz_bytes(made.mesh, item.name, texture, made.invented)
-        with whole_file(path) as part:
-            part.write_bytes(content)
+        write_bytes(path, usdz_bytes(made.mesh, item.name, texture, made.invented))
         return made.facts() | {"texture": facts}
 
 
 def packed(layer: Path) -> bytes:
-    """Return the content of a .usdz of a layer and the files beside it that it names."""
+    """Return the content of a .usdz that holds a layer and the files beside it that it refers to."""
     Sdf, UsdUtils = modules("Sdf", "UsdUtils")
     package = layer.with_suffix(".usdz")
     for file in layer.parent.iterdir():
-        os.utime(file, (_LONG_AGO, _LONG_AGO))  # a package keeps times: the same bytes at any
+        os.utime(file, (_LONG_AGO, _LONG_AGO))  # A package holds times, which would change the bytes.
     if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(layer)), str(package)):
         raise RuntimeError("Pixar's USD library packed nothing")
     return package.read_bytes()
@@ -67,7 +65,7 @@ def packed(layer: Path) -> bytes:
 def usdz_bytes(mesh: Mesh, name: str, texture: Texture | None = None, invented: np.ndarray | None = None) -> bytes:
     """Return the file's content; the mesh has z up and the file y. Its unit is the metre.
 
-    invented: [V] bool; with it vertices have the primvar ``invented``, 1 where nothing but closing put them.
+    invented: [V] bool; with it vertices have the primvar ``invented``, 1 where only closing put them.
     """
     with tempfile.TemporaryDirectory() as folder:
         layer = Path(folder) / "mesh.usdc"
@@ -78,7 +76,7 @@ def usdz_bytes(mesh: Mesh, name: str, texture: Texture | None = None, invented: 
 
 
 def modules(*names: str) -> list[Any]:
-    """Return modules of Pixar's library, which tells no types."""
+    """Return modules of Pixar's library, which has no types."""
     return [import_module(f"pxr.{name}") for name in names]
 
 
@@ -103,7 +101,7 @@ def _write_layer(path: Path, mesh: Mesh, name: str, texture: Texture | None, inv
             Vt.Vec3fArray.FromNumpy(colors)
         )
     else:
-        uv = (texture.atlas.uv * [1.0, -1.0] + [0.0, 1.0]).astype(np.float32)  # from the bottom
+        uv = (texture.atlas.uv * [1.0, -1.0] + [0.0, 1.0]).astype(np.float32)  # USD counts v from the bottom.
         primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, of_vertex).Set(Vt.Vec2fArray.FromNumpy(uv))
     if invented is not None:
         marks = Vt.FloatArray.FromNumpy(invented[source].astype(np.float32))
@@ -113,7 +111,7 @@ def _write_layer(path: Path, mesh: Mesh, name: str, texture: Texture | None, inv
 
 
 def define_mesh(stage: Any, path: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
-    """Return a new mesh of a stage, of vertices [V, 3] in its frame and triangles [F, 3]."""
+    """Define a mesh in a stage, of vertices [V, 3] in its frame and triangles [F, 3], and return it."""
     Gf, UsdGeom, Vt = modules("Gf", "UsdGeom", "Vt")
     shape, places = UsdGeom.Mesh.Define(stage, path), vertices.astype(np.float32)
     shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(places))
@@ -125,7 +123,7 @@ def define_mesh(stage: Any, path: str, vertices: np.ndarray, faces: np.ndarray) 
 
 
 def _bind_material(stage: Any, shape: Any, textured: bool) -> None:
-    """Give a mesh a material that emits its texture, or without one the colours of its vertices."""
+    """Bind a material to a mesh that emits its texture, or without one the colours of its vertices."""
     Gf, Sdf, UsdShade = modules("Gf", "Sdf", "UsdShade")
     kinds = Sdf.ValueTypeNames
     material = UsdShade.Material.Define(stage, "/Object/Material")
@@ -137,7 +135,7 @@ def _bind_material(stage: Any, shape: Any, textured: bool) -> None:
 
     surface = shader("Surface", "UsdPreviewSurface")
     surface.CreateInput("diffuseColor", kinds.Color3f).Set(Gf.Vec3f(0.0))
-    surface.CreateInput("useSpecularWorkflow", kinds.Int).Set(1)  # else it would shine at its rims
+    surface.CreateInput("useSpecularWorkflow", kinds.Int).Set(1)  # Otherwise the mesh would shine at its rims.
     surface.CreateInput("specularColor", kinds.Color3f).Set(Gf.Vec3f(0.0))
     surface.CreateInput("roughness", kinds.Float).Set(1.0)
     if textured:

@@ -1,4 +1,4 @@
-"""One self-contained .html of an object: viser's viewer with the Gaussians inside, which loads nothing else."""
+"""One self-contained .html of an object: viser's viewer with the Gaussians inside, which loads no other file."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from beags_plugin.core.densification import SH_C0
 from beags_plugin.core.rotations import rotation_from_quat
+from beags_plugin.core.sh import SH_C0
 from beags_plugin.export.base import Exporter
 from beags_plugin.export.page_colors import SeenColors, seen_colors
 from beags_plugin.export.splat_values import SplatValues, splat_values
-from beags_plugin.splat_io.files import whole_file
+from beags_plugin.splat_io.files import write_bytes
 from beags_plugin.surfaces.frames import bounding_box
 from beags_plugin.surfaces.item import ExportItem
 from beags_plugin.system.errors import UserError
 
 _FIELD_OF_VIEW = math.radians(40.0)  # vertical
-_SCENE = "scene.viser"  # under which the viewer asks for its recording
-_SKY = "potsdamer_platz_1k.hdr"  # and for the light of meshes, of which there are none
+_SCENE = "scene.viser"  # name under which the viewer requests its recording
+_SKY = "potsdamer_platz_1k.hdr"  # name under which it requests the light of meshes, of which there are none
 _DARK = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 1\n\x80\x80\x80\x80"  # an .hdr of one grey pixel
 _START = 'get("playbackPath")'
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' data:; worker-src data:; connect-src data:; "
     "style-src 'unsafe-inline'; img-src data: blob:"
 )
-"""What the page may load: nothing but what it holds."""
+"""The page's policy: it may load only data that it holds itself."""
 
 
 @dataclass(frozen=True)
 class WebPageExporter(Exporter):
-    """A page to send to a friend, with the viewer of viser, which comes with nerfstudio. Colours are fixed.
+    """A page to share, with the viewer of viser, which comes with nerfstudio. Colours do not change with the view.
 
-    The object fills the picture at first, seen from where the training photos show most of it.
+    At first the object fills the image, seen from the training camera that shows most of it.
     """
 
     suffix: ClassVar[str] = "html"
@@ -58,42 +58,41 @@ class WebPageExporter(Exporter):
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
         if item.views is None:
             raise ValueError("a page needs the views of the training photos")
-        splat_values(item.surfels, item.name)  # raises NothingToExport
+        splat_values(item.surfels, item.name)  # It raises NothingToExport before anything is rendered.
         seen = seen_colors(item.surfels, item.views, item.on_render)
-        page = web_page(item.name, recording(item, seen))
-        with whole_file(path) as part:
-            part.write_text(page, "utf8")
+        write_bytes(path, web_page(item.name, recording(item, seen)).encode())
         return {}
 
 
 def recording(item: ExportItem, seen: SeenColors) -> bytes:
     """Return viser's recording of one moment: the Gaussians in a ball of radius 1, and the camera."""
-    from msgspec import msgpack  # as viser does it
-    from viser import _messages as messages  # pinned by nerfstudio; the public interface wants a server's port
+    from msgspec import msgpack  # viser's own encoder
+    from viser import _messages as messages  # nerfstudio pins viser; its public interface needs a server's port
 
     low, high = (end.numpy() for end in bounding_box(item.surfels))
     middle = (low + high) / 2
     radius = max(float(np.linalg.norm(high - low)) / 2, 1e-9)
     values = splat_values(seen.surfels, item.name)
-    distance = 1.0 / math.sin(_FIELD_OF_VIEW / 2)
-    shown = [
+    away = seen.eye - middle
+    away = 1.0 / math.sin(_FIELD_OF_VIEW / 2) * (away / max(float(np.linalg.norm(away)), 1e-12))
+    moment = [
         messages.GaussianSplatsMessage("/object", splat_buffer(values, middle, radius)),
         messages.SetSceneNodeVisibilityMessage("/WorldAxes", False),
         messages.SetCameraFovMessage(_FIELD_OF_VIEW),
         messages.SetCameraUpDirectionMessage(_three(seen.up)),
-        messages.SetCameraPositionMessage(_three(distance * _unit(seen.eye - middle))),
+        messages.SetCameraPositionMessage(_three(away)),
         messages.SetCameraLookAtMessage((0.0, 0.0, 0.0)),
     ]
     content = {
         "loopStartIndex": None,
         "durationSeconds": 0.0,
-        "messages": [(0.0, message.as_serializable_dict()) for message in shown],
+        "messages": [(0.0, message.as_serializable_dict()) for message in moment],
     }
     return gzip.compress(msgpack.encode(content), mtime=0)
 
 
 def splat_buffer(values: SplatValues, middle: np.ndarray, radius: float) -> np.ndarray:
-    """Return viser's [N, 8] uint32: means, a gap, the lower triangular root of the covariance as float16, RGBA."""
+    """Return viser's [N, 8] uint32: means, padding, the lower triangular root of the covariance as float16, RGBA."""
     means = ((values.means - middle) / radius).astype("<f4")
     roots = _covariance_roots(values.quats, np.exp(values.log_scales) / radius).astype("<f2")
     colors = values.sh_dc * SH_C0 + 0.5
@@ -115,7 +114,7 @@ def web_page(title: str, scene: bytes) -> str:
     script, style = _viewer()
     files = {_SCENE: scene, _SKY: _DARK}
     held = ", ".join(f'"{name}": "{_data_url(content, "application/octet-stream")}"' for name, content in files.items())
-    # The viewer fetches two files beside its page; a page opened from a disk has nothing beside it.
+    # The viewer fetches two files beside its page; a page opened from a disk has no files beside it.
     fetch = (
         f"const held = {{{held}}}; const outer = window.fetch;"
         "window.fetch = (what, how) => { const address = String(what.url ?? what);"
@@ -134,9 +133,9 @@ def web_page(title: str, scene: bytes) -> str:
 
 
 def _viewer() -> tuple[str, str]:
-    """Return script and style sheet of viser's viewer, with all files that they load inside.
+    """Return the script and style sheet of viser's viewer, with all files that they load inside.
 
-    Raises ``ImportError`` without viser, ``UserError`` if its viewer is not put together as that of 0.2.7.
+    Raises ``ImportError`` without viser, ``UserError`` if its viewer is not built as that of 0.2.7.
     """
     import viser
 
@@ -154,16 +153,12 @@ def _viewer() -> tuple[str, str]:
     if "/assets/" in script or script.count(_START) != 1 or _SKY not in script:
         raise UserError(f"the viewer of viser {version('viser')} does not fit into one page")
     script = script.replace(_START, f'{_START}??"{_SCENE}"').replace("</script", r"<\/script")
-    style = re.sub(r"@font-face\s*{[^}]*}", "", styles[0].read_text("utf8"))  # a file of its own; another font serves
+    style = re.sub(r"@font-face\s*{[^}]*}", "", styles[0].read_text("utf8"))  # Fonts are files.
     return script, style
 
 
 def _data_url(content: bytes, kind: str) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / max(float(np.linalg.norm(vector)), 1e-12)
 
 
 def _three(vector: np.ndarray) -> tuple[float, float, float]:

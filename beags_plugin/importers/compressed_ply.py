@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from beags_plugin.core.densification import SH_C0
+from beags_plugin.core.sh import SH_C0
 from beags_plugin.importers.base import ImportedScene, Importer
 from beags_plugin.importers.packed import cut_bands, gaussians_of, reading, sh_degree, with_largest
 from beags_plugin.splat_io.ply import DISC_COMMENT

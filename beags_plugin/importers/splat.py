@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from beags_plugin.core.densification import SH_C0
+from beags_plugin.core.sh import SH_C0
 from beags_plugin.importers.base import ImportedScene, Importer
 from beags_plugin.importers.packed import gaussians_of, log_lengths, reading
 from beags_plugin.system.reading.stand_ins import stand_in, starts_as

@@ -31,13 +31,12 @@ from beags_plugin.objects.pose import metres_per_unit
 from beags_plugin.objects.shown import Shown
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.runs.run import Run
-from beags_plugin.splat_io.far_worlds import local_origin, said_of_far, unlist, write_origin
+from beags_plugin.splat_io.far_worlds import far_world_note, local_origin, unlist, write_origin
 from beags_plugin.splat_io.files import whole_file
-from beags_plugin.surfaces.frames import check_placement
 from beags_plugin.surfaces.item import ExportItem
 from beags_plugin.surfaces.mesh_options import MeshOptions
 from beags_plugin.surfaces.meshing import open3d_missing
-from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.errors import UserError, check_choice, writing
 from beags_plugin.system.reading.text import load_json
 from beags_plugin.system.whole_files import remove_unfinished
 
@@ -76,7 +75,7 @@ def export_run(
     objects without Gaussians, with ``everything``. Raises ``UserError`` for a mistake, before anything is written.
     """
     run, folder, pose = Run(config_path, data), output or config_path.parent / "exports", pose or PoseOptions()
-    check_placement(placement)
+    check_choice(placement, ("world", "object"), "frame")
     if pose.centre and placement == "object":
         raise UserError("--centre puts the origin under objects, --frame object into their middle: leave one out.")
     exporters = {name: make_exporter(name, **(options or {}).get(name, {})) for name in formats}
@@ -126,7 +125,7 @@ def export_run(
     if job.shift is not None:
         say(_far(folder, job.shift, [file for one in exported for file in one.files if file.path is not None]))
     elif origin is not None and placement == "world" and not pose.centre:
-        say(said_of_far(origin, False, False))
+        say(far_world_note(origin, False, False))
     if everything:
         empty = empty_objects(scene, run.folder)
         world = "run" if transform is None else "input"
@@ -150,7 +149,7 @@ def _far(folder: Path, origin: Tensor, files: Sequence[ExportedFile]) -> str:
     others = [file.path.name for file in files if file.path is not None and "origin" in file.facts]
     if others:
         write_origin(folder, origin, others)
-    return said_of_far(origin, len(others) < len(files), bool(others))
+    return far_world_note(origin, len(others) < len(files), bool(others))
 
 
 def _clear_up(folder: Path, names: Set[str] | None) -> None:

@@ -24,7 +24,7 @@ from beags_plugin.runs.layout import EXTRACTION_FILE, digest_of_prepared
 from beags_plugin.runs.read import SavedScene
 from beags_plugin.runs.run import Run
 from beags_plugin.runs.write import write_run
-from beags_plugin.splat_io.far_worlds import about, local_origin, said_of_far, to_world
+from beags_plugin.splat_io.far_worlds import about, far_world_note, local_origin, to_world
 from beags_plugin.splat_io.ply import write_ply
 from beags_plugin.system.errors import UserError, check_choice, writing
 from beags_plugin.system.whole_files import write_text_atomically
@@ -102,7 +102,7 @@ def extract_objects(
         if progress is not None:
             progress(len(written), len(names))
     if amid is not None:
-        say(said_of_far(amid, True, False))
+        say(far_world_note(amid, True, False))
     if not objects and (empty := {name: index for name, index in empty_objects(scene, run).items() if index != 0}):
         say(said_of_empty(empty, "extracted"))
     return written

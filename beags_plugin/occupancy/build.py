@@ -25,7 +25,7 @@ MIN_ALPHA_LIFTED = 0.5  # pixels with less alpha are not lifted
 
 @dataclass(frozen=True)
 class _View:
-    """The P solid pixels of a view: solid [H, W] bool; of them, row by row, depth [P] float and class_id [P]."""
+    """The P solid pixels of a view: solid [H, W] bool; row by row, their depth [P] float and class_id [P]."""
 
     camera: Camera
     solid: Tensor
@@ -74,9 +74,9 @@ def build_visibility_grid(
     """Render depth and class of every view, lift the pixels with A >= 0.5, and voxelise them per class.
 
     surfels: N Gaussians. class_ids: [N] int32, phi, below ``num_classes``.
-    k: sets the voxel size (E8); seed: of the points that measure it. depth: the lifted depth (``surface_depth``).
-    Solid pixels lie in a temporary file (6 bytes each for up to 256 class ids), read twice, view by view: memory grows
-    with the voxels and with the points that measure their size.
+    k: sets the voxel size (E8); seed: selects the points that measure it. depth: the lifted depth (``surface_depth``).
+    Solid pixels lie in a temporary file (6 bytes each for up to 256 class ids), read twice, view by view, so memory
+    grows only with the voxels and with the points that measure their size.
     Raises ``UserError`` if no pixel of any view reaches an alpha of 0.5.
     """
     settings = replace(settings, geometry=True, distortion=False)

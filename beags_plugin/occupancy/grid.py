@@ -15,46 +15,39 @@ from beags_plugin.ops.voxel_lookup import VoxelLookup
 from beags_plugin.ops.voxel_tally import VoxelTally
 from beags_plugin.system.errors import UserError
 
-DENSE_BYTES = 256 * 2**20  # up to this size, validity is kept as one byte per class and voxel
-_BOX = 4  # voxels along each side of the largest box that ``disc_inside`` looks at
-_BITS = 21  # of each of the three voxel indices in a key
+_BOX = 4  # voxels along each side of the largest box that ``disc_inside`` tests
+_BITS = 21  # bits of each of the three voxel indices in a key
 _HALF = 1 << (_BITS - 1)
 
 
 class VisibilityGrid:
     """The voxels that support each class: those that hold lifted points of this class alone.
 
-    D_occ(x, V_phi) is the number of occupied voxels of V_phi among the 27 around x. An empty grid, of a class that is
-    never seen or collides everywhere, has D_occ = 0: all of the class is penalised.
+    D_occ(x, V_phi) is the number of occupied voxels of V_phi among the 27 around x. A class without voxels, which is
+    never seen or collides everywhere, has D_occ = 0: all of it is penalised.
 
     voxel_size: world units. origin: [3] float64, corner of voxel (0, 0, 0), world. num_classes: ids lie below it;
         memory and speed depend on the number of classes with voxels.
     keys: [M] int64, sorted: the occupied voxels, 21 bits per axis. classes: [M] int32, the class of each.
-    dense_bytes: see ``DENSE_BYTES``; 0 forces sorted keys. It affects the speed of ``valid`` without the extension.
     """
 
-    def __init__(
-        self, voxel_size: float, origin: Tensor, num_classes: int, keys: Tensor, classes: Tensor,
-        dense_bytes: int = DENSE_BYTES,
-    ) -> None:  # fmt: skip
+    def __init__(self, voxel_size: float, origin: Tensor, num_classes: int, keys: Tensor, classes: Tensor) -> None:
         if not voxel_size > 0:
             raise ValueError(f"the voxel size must be positive, not {voxel_size}")
         self.voxel_size = float(voxel_size)
         self.origin = origin.to(torch.float64)
         self.num_classes = num_classes
         self.keys, self.classes = keys, classes
-        self._dense_bytes = dense_bytes
         self._lookup: VoxelLookup | None = None
         self._prepared = False
 
     @classmethod
     def from_points(
-        cls, clouds: Iterable[tuple[Tensor, Tensor]], voxel_size: float, origin: Tensor, num_classes: int,
-        dense_bytes: int = DENSE_BYTES,
-    ) -> VisibilityGrid:  # fmt: skip
+        cls, clouds: Iterable[tuple[Tensor, Tensor]], voxel_size: float, origin: Tensor, num_classes: int
+    ) -> VisibilityGrid:
         """Build the grid of lifted points; a voxel in which classes collide is empty in all (method, section 5).
 
-        clouds: pairs (points [P, 3] float, class_ids [P] int), read one by one, one per view.
+        clouds: pairs (points [P, 3] float, class_ids [P] int), one per view, read one by one.
         Raises ``UserError`` if the cloud spans more than 2^21 voxels along an axis.
         """
         origin = origin.to(torch.float64)
@@ -68,7 +61,7 @@ class VisibilityGrid:
                     tally.add_points(points, class_ids.int(), origin, voxel_size)
                 if not tally.all_near():
                     raise _too_far(voxel_size)
-                return cls(voxel_size, origin, num_classes, *tally.pure(), dense_bytes)
+                return cls(voxel_size, origin, num_classes, *tally.pure())
         keys = torch.zeros(0, dtype=torch.int64, device=origin.device)
         classes = keys.int()
         for points, class_ids in clouds:
@@ -76,21 +69,19 @@ class VisibilityGrid:
             keys, classes = _distinct(torch.cat([keys, own]), torch.cat([classes, class_ids.int()]), num_classes)
         _, voxel, seen = torch.unique(keys, return_inverse=True, return_counts=True)
         alone = seen[voxel] == 1
-        return cls(voxel_size, origin, num_classes, keys[alone], classes[alone], dense_bytes)
+        return cls(voxel_size, origin, num_classes, keys[alone], classes[alone])
 
     def only(self, classes: Tensor) -> VisibilityGrid:
         """Return the grid of some classes alone, which needs less memory. classes: [C] int, ids in any order."""
-        kept = torch.isin(self.classes, classes.to(self.classes))
-        return VisibilityGrid(
-            self.voxel_size, self.origin, self.num_classes, self.keys[kept], self.classes[kept], self._dense_bytes
-        )
+        chosen = torch.isin(self.classes, classes.to(self.classes))
+        return VisibilityGrid(self.voxel_size, self.origin, self.num_classes, self.keys[chosen], self.classes[chosen])
 
     def to(self, device: torch.device | str) -> VisibilityGrid:
         """Return the grid on a device; itself if it lies there already."""
         if self.keys.device == torch.device(device):
             return self
         parts = (self.keys.to(device), self.classes.to(device))
-        return VisibilityGrid(self.voxel_size, self.origin.to(device), self.num_classes, *parts, self._dense_bytes)
+        return VisibilityGrid(self.voxel_size, self.origin.to(device), self.num_classes, *parts)
 
     def lookup(self) -> VoxelLookup | None:
         """Return the compiled lookup, built on first use; None without the extension (for a GPU, with CUDA)."""
@@ -115,8 +106,8 @@ class VisibilityGrid:
         for class_id in class_ids.unique().tolist():
             own = self.keys[self.classes == class_id]
             if class_id != IGNORE and len(own):
-                asked = torch.nonzero(usable & (class_ids == class_id))[:, 0]
-                total[asked] = _count(own, _voxels(points[asked], self.origin, self.voxel_size))
+                of_class = torch.nonzero(usable & (class_ids == class_id))[:, 0]
+                total[of_class] = _count(own, _voxels(points[of_class], self.origin, self.voxel_size))
         return total
 
     def valid(self, points: Tensor, class_ids: Tensor) -> Tensor:
@@ -149,12 +140,12 @@ class VisibilityGrid:
         span = high - low
         inside = (span <= _BOX - 1).all(-1)  # False for NaN
         for step in sorted(itertools.product(range(_BOX), repeat=3), key=max):
-            if max(step) != 1:  # few boxes reach beyond the next voxel
-                asked = torch.nonzero(inside & (span.amax(-1) >= max(step)))[:, 0]
-            if len(asked) == 0:
+            if max(step) != 1:  # Few boxes reach beyond the next voxel.
+                reaching = torch.nonzero(inside & (span.amax(-1) >= max(step)))[:, 0]
+            if len(reaching) == 0:
                 break
             offset = span.new_tensor(step)
-            chosen = asked[(span[asked] >= offset).all(-1)]
+            chosen = reaching[(span[reaching] >= offset).all(-1)]
             inside[chosen] = self._member(low[chosen] + offset, class_ids[chosen]) & inside[chosen]
         return inside
 
@@ -201,11 +192,6 @@ class VisibilityGrid:
         for stride in self._strides:  # the 27 neighbours, axis by axis; the border keeps them inside the box
             linear = torch.unique(torch.cat([linear - stride, linear, linear + stride]))
         self._valid_keys = linear
-        self._volume: Tensor | None = None
-        if len(self._ranks) * self._per_class <= self._dense_bytes:
-            self._volume = torch.zeros(len(self._ranks) * self._per_class, dtype=torch.bool, device=device)
-            self._volume[linear] = True
-            self._valid_keys = linear[:0]
 
     def _member(self, voxels: Tensor, class_ids: Tensor) -> Tensor:
         """Look up whole float voxels [P, 3] relative to the box; those outside are moved to its border."""
@@ -213,11 +199,9 @@ class VisibilityGrid:
         known = ranks < len(self._ranks)
         linear = ranks.masked_fill(~known, 0).long() * self._per_class
         for axis, stride in enumerate(self._strides):
-            # nan_to_num: NaN goes to the border too
+            # nan_to_num moves NaN to the border too.
             index = voxels[:, axis].nan_to_num(nan=0.0).clamp(0, self._last[axis])
             linear = linear + index.long() * stride
-        if self._volume is not None:
-            return self._volume[linear] & known
         if len(self._valid_keys) == 0:
             return torch.zeros_like(linear, dtype=torch.bool)
         position = torch.searchsorted(self._valid_keys, linear).clamp_(max=len(self._valid_keys) - 1)
@@ -225,7 +209,7 @@ class VisibilityGrid:
 
 
 def _distinct(keys: Tensor, classes: Tensor, num_classes: int) -> tuple[Tensor, Tensor]:
-    """Return the distinct pairs, ordered; 64 bits hold a key's rank and a class, but no key."""
+    """Return the distinct pairs, ordered; a key's rank and a class fit into 64 bits, a key and a class do not."""
     voxels, rank = torch.unique(keys, return_inverse=True)
     pairs = torch.unique(rank * num_classes + classes)
     return voxels[pairs // num_classes], (pairs % num_classes).int()
@@ -245,7 +229,7 @@ def _count(keys: Tensor, voxels: Tensor) -> Tensor:
 def _scaled(points: Tensor, origin: Tensor, size: float) -> Tensor:
     """Return voxel indices as whole floats. Each step is monotonic, as ``disc_inside`` requires.
 
-    The divisor lies beside the points: by a number a GPU multiplies with the inverse, which ends in other bits.
+    The divisor is a tensor: torch divides by a number on a GPU by multiplying with its inverse, which rounds otherwise.
     """
     return torch.floor((points - origin.to(points)) / points.new_full((), size))
 

@@ -1,4 +1,4 @@
-"""Random points of the UV disc by a hash of counters, whatever else is sampled (method, section 6)."""
+"""Random points of the UV disc by a hash of counters, independent of all other sampling (method, section 6)."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import math
 import torch
 from torch import Tensor
 
-RADIUS = 3.0  # of the disc, in units of the scales (method, section 6)
+RADIUS = 3.0  # the disc's radius, in units of the scales (method, section 6)
 
 _WORD = (1 << 64) - 1
 _GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / golden ratio: counters times it are spread over all bits
-_MULTIPLIERS = (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)  # of SplitMix64, as are the shifts 30, 27, 31
+_MULTIPLIERS = (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)  # multipliers of SplitMix64, as are the shifts 30, 27, 31
 
 
 def _mix(word: int) -> int:
@@ -55,7 +55,7 @@ def disc_points(words: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
 
     float32 and float64 give the same points, up to rounding.
     """
-    # 24 bits a coordinate, as in float32; the two halves of the word are independent
+    # Each coordinate has 24 bits, as in float32; the two halves of the word are independent.
     radial = _logical_shift(words, 40).to(dtype) * 2.0**-24
     angle = ((words >> 8) & 0xFFFFFF).to(dtype) * (2.0**-24 * 2.0 * math.pi)
     radius = RADIUS * radial.sqrt()  # area grows with the square of the radius

@@ -19,8 +19,8 @@ _CHUNK_POINTS = 1 << 18  # points looked up at a time: bounds the memory
 class DiscSums:
     """Sums over points x_r of the disc of each Gaussian, [N] float64; 0 for Gaussians that are not finite.
 
-    whole: sum_r G(x_r). wrong: sum_r G(x_r) Q(x_r), the part at places where the class was never seen. The loss is
-    the mean over Gaussians of opacity times ``wrong``, divided by the number of points.
+    whole: sum_r G(x_r). wrong: sum_r G(x_r) Q(x_r), the part where the class was never seen. The loss is the mean over
+    Gaussians of opacity times ``wrong``, divided by the number of points.
     """
 
     whole: Tensor
@@ -46,9 +46,10 @@ def disc_sums(
     """
     means = surfels.means.detach()
     axes = surfels.log_scales.detach().exp()[:, None, :] * rotation_from_quat(surfels.quats.detach())[..., :2]
-    asked = ~grid.disc_inside(means, RADIUS * axes[..., 0], RADIUS * axes[..., 1], class_ids)  # exactly 0 inside
+    # Discs inside valid voxels have a ``wrong`` of exactly 0.
+    tested = ~grid.disc_inside(means, RADIUS * axes[..., 0], RADIUS * axes[..., 1], class_ids)
     if not background:
-        asked &= class_ids != 0
+        tested &= class_ids != 0
     whole = torch.zeros(len(surfels), dtype=torch.float64, device=means.device)
     wrong = torch.zeros_like(whole)
     numbers = torch.arange(samples, device=means.device)
@@ -57,8 +58,8 @@ def disc_sums(
         u, v = disc_points(sample_words(seed, step, part, numbers), means.dtype)  # [Z, m]
         weight = torch.exp(-0.5 * (u * u + v * v))
         whole[part] = weight.sum(0, dtype=torch.float64)
-        there = asked[part]
-        part, u, v, weight = part[there], u[:, there], v[:, there], weight[:, there]
+        chosen = tested[part]
+        part, u, v, weight = part[chosen], u[:, chosen], v[:, chosen], weight[:, chosen]
         points = means[part] + u[..., None] * axes[part, :, 0] + v[..., None] * axes[part, :, 1]
         valid = grid.valid(points.view(-1, 3), class_ids[part].repeat(samples)).view_as(u)
         wrong[part] = weight.masked_fill(valid, 0.0).sum(0, dtype=torch.float64)
@@ -66,8 +67,8 @@ def disc_sums(
 
 
 def violation_shares(
-    surfels: Surfels, class_ids: Tensor, grid: VisibilityGrid, samples: int = 20, background: bool = True, seed: int = 0
+    surfels: Surfels, class_ids: Tensor, grid: VisibilityGrid, samples: int = 20, background: bool = True
 ) -> Tensor:
     """Return ``wrong`` / ``whole`` of ``disc_sums``, [N] float in 0..1."""
-    sums = disc_sums(surfels, class_ids, grid, samples, background, seed)
+    sums = disc_sums(surfels, class_ids, grid, samples, background)
     return (sums.wrong / sums.whole.clamp_min(torch.finfo(torch.float64).tiny)).to(surfels.means.dtype)

@@ -8,23 +8,11 @@ import warnings
 import numpy as np
 
 MAX_REFERENCE = 400_000  # points searched; a larger cloud is thinned to this many
-_LEAST_NEIGHBOURS = 16  # keep enough points that the rounding of k / f stays small
-
-
-def voxel_size(
-    points: np.ndarray, k: int = 2000, seed: int = 0, num_queries: int = 2000, max_reference: int = MAX_REFERENCE
-) -> float:
-    """Return s = (k / rho)^(1/3) with rho = k / (4/3 pi d_k^3), so s = (4 pi / 3)^(1/3) d_k (E8); world units.
-
-    points: [P, 3] float, P >= 1. k: neighbours; seed: of thinning and sampling.
-    Raises ``ValueError`` for an empty cloud; warns and falls back if d_k cannot be measured.
-    """
-    chosen = reference_indices(len(points), k, seed, max_reference)
-    return voxel_size_of_reference(points[chosen], len(points), k, seed, num_queries)
+_LEAST_NEIGHBOURS = 16  # least k / f, so that its rounding stays small
 
 
 def reference_indices(total: int, k: int, seed: int = 0, max_reference: int = MAX_REFERENCE) -> np.ndarray:
-    """Return sorted int64 indices of the kept points of ``total``: all, or about ``max_reference`` at random."""
+    """Return the sorted int64 indices of all ``total`` points, or of about ``max_reference`` random ones."""
     count = max(max_reference, math.ceil(total * min(1.0, _LEAST_NEIGHBOURS / k)))
     if total <= count:
         return np.arange(total)
@@ -34,7 +22,11 @@ def reference_indices(total: int, k: int, seed: int = 0, max_reference: int = MA
 def voxel_size_of_reference(
     reference: np.ndarray, total: int, k: int = 2000, seed: int = 0, num_queries: int = 2000
 ) -> float:
-    """Return ``voxel_size`` of ``total`` points, of which ``reference`` [R, 3] was kept evenly at random."""
+    """Return s = (k / rho)^(1/3) with rho = k / (4/3 pi d_k^3), so s = (4 pi / 3)^(1/3) d_k (E8); world units.
+
+    reference: [R, 3] float, R >= 1, the points of ``reference_indices`` of a cloud of ``total`` points. k: neighbours;
+    seed: selects the queries. Raises ``ValueError`` for an empty cloud; warns and falls back if d_k cannot be measured.
+    """
     from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
 
     if k < 1:
@@ -43,14 +35,14 @@ def voxel_size_of_reference(
         raise ValueError("an empty cloud has no voxel size")
     reference = np.asarray(reference, dtype=np.float64)
     available = len(reference) - 1  # the query itself is no neighbour
-    kept = len(reference) / total  # 1 / f
-    neighbours = max(1, round(k * kept))  # k / f: with k fixed, thinning would enlarge the voxel
-    # d grows with the cube root of k; this undoes the rounding of k / f
-    rounding = (k * kept / neighbours) ** (1 / 3)
+    share = len(reference) / total  # 1 / f
+    neighbours = max(1, round(k * share))  # k / f: with k fixed, thinning would enlarge the voxel
+    # d grows with the cube root of k; this factor undoes the rounding of k / f.
+    rounding = (k * share / neighbours) ** (1 / 3)
     if neighbours > available:
         if available:
             warnings.warn(
-                f"the voxel size wants {neighbours} neighbours, the views show {available}: all of them are taken.",
+                f"the voxel size needs {neighbours} neighbours, but the views show {available}: all are used.",
                 stacklevel=2,
             )
         neighbours, rounding = max(available, 1), 1.0
@@ -63,7 +55,7 @@ def voxel_size_of_reference(
         neighbours = min(2 * neighbours, available)
         distance = _mean_distance(tree, queries, neighbours)
     if distance == 0.0:
-        # any length serves for one place; this one scales with the scene
+        # Any size serves a single place; this one scales with the scene.
         size = 1e-3 * (float(np.abs(reference).max()) or 1.0)
         warnings.warn(f"all points of the views coincide, so the voxel size is set to {size:.4g}.", stacklevel=2)
         return size

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from types import ModuleType
 from typing import Any
@@ -11,11 +12,11 @@ from torch import Tensor
 
 from beags_plugin.ops import extension
 
-_refused: list[str] = []  # why this process does without it, though it is there
+_refused: list[str] = []  # the reason, if any, why this process does not use a module that is present
 
 
 def refuse(reason: str) -> None:
-    """Do without the module from now on, for a reason in one sentence: it does not work on this machine's GPU."""
+    """Do not use the module from now on. reason: one sentence on why it does not work on this machine's GPU."""
     _refused[:] = [reason]
 
 
@@ -26,7 +27,7 @@ def status() -> tuple[ModuleType | None, str | None]:
 
 @cache
 def present() -> tuple[ModuleType | None, str | None]:
-    """Return what ``status`` does, whatever has been refused."""
+    """Return what ``status`` would return had nothing been refused."""
     module, reason = extension.status()
     if module is None:
         return None, reason
@@ -42,8 +43,8 @@ def present() -> tuple[ModuleType | None, str | None]:
     driver, needed = cuda.driver_version(), cuda.needed_driver_version()
     if driver < needed:
         return None, (
-            f"the GPU's driver knows CUDA up to {_dotted(driver)}, but beags was built with nvcc for {_dotted(needed)} "
-            "or newer; update the driver, or reinstall beags with an older nvcc (CUDACXX names one)."
+            f"the GPU's driver supports CUDA up to {_dotted(driver)}, but beags was built with nvcc for "
+            f"{_dotted(needed)} or newer; update the driver, or reinstall beags with an older nvcc (CUDACXX names one)."
         )
     return cuda, None
 
@@ -73,27 +74,16 @@ def supports(*tensors: Tensor) -> bool:
 
 
 def stream(device: torch.device) -> int:
-    """Return torch's current stream there; 0, the emulation's, for the CPU."""
+    """Return torch's current stream on ``device``; 0, the emulation's, for the CPU."""
     return torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0
 
 
-class on_device:
-    """Makes a GPU the current one, as launches of kernels need it; does nothing for the CPU (the emulation's)."""
-
-    def __init__(self, device: torch.device) -> None:
-        self._guard: Any = torch.cuda.device(device) if device.type == "cuda" else None
-
-    def __enter__(self) -> None:
-        if self._guard is not None:
-            self._guard.__enter__()
-
-    def __exit__(self, *raised: Any) -> None:
-        if self._guard is not None:
-            self._guard.__exit__(*raised)
+def on_device(device: torch.device) -> AbstractContextManager:
+    """Return a context in which ``device`` is torch's current GPU, as kernel launches need; empty for the CPU."""
+    return torch.cuda.device(device) if device.type == "cuda" else nullcontext()
 
 
 def call(module: ModuleType, name: str, like: Tensor, *arguments: Any) -> Any:
     """Call ``name`` of the module for the dtype and on the device of ``like``, with the stream as the last argument."""
-    suffix = "f32" if like.dtype == torch.float32 else "f64"
     with on_device(like.device):
-        return getattr(module, f"{name}_{suffix}")(*arguments, stream(like.device))
+        return extension.function(name, like, module)(*arguments, stream(like.device))

@@ -1,4 +1,4 @@
-"""The compiled module, if there is one, and what all fronts check."""
+"""The compiled module, if there is one, and the checks that all fronts share."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cache
 from importlib import import_module
 from types import ModuleType
 
-import torch  # before _native, which shares the OpenMP library that torch loads
+import torch  # must precede _native, which shares torch's OpenMP library
 from torch import Tensor
 
 from beags_plugin.system.errors import UserError
@@ -19,7 +19,7 @@ _SUFFIXES = {torch.float32: "f32", torch.float64: "f64"}
 def status() -> tuple[ModuleType | None, str | None]:
     """Return ``beags_plugin._native``, or one sentence on why it is not there.
 
-    Raises ``UserError`` if the instruction set that the environment asks for cannot run: nothing may hide that.
+    Raises ``UserError`` if the instruction set that the environment requests cannot run: nothing may hide that.
     """
     if os.environ.get("BEAGS_NATIVE") == "0":
         return None, "BEAGS_NATIVE=0 in the environment turns the compiled module off; unset it."
@@ -55,9 +55,9 @@ def supports(*tensors: Tensor) -> bool:
 
 def module() -> ModuleType:
     """Return the compiled module for a caller that knows from ``load`` or ``supports`` that it is there."""
-    found = load()
-    assert found is not None, "the caller asks extension.load() first"
-    return found
+    compiled = load()
+    assert compiled is not None, "the caller checks extension.load() first"
+    return compiled
 
 
 def function(name: str, like: Tensor, owner: object | None = None):
@@ -67,7 +67,7 @@ def function(name: str, like: Tensor, owner: object | None = None):
 
 def scaled(gradient: Tensor, factor: Tensor) -> Tensor:
     """Return ``gradient`` times the scalar ``factor``; itself, not a copy, where that is 1, as for most losses."""
-    if factor.is_cuda:  # looking at the number would make the host wait
+    if factor.is_cuda:  # Reading the number would make the host wait.
         return gradient * factor
     return gradient if factor.item() == 1.0 else gradient * factor
 

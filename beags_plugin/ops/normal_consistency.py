@@ -15,8 +15,8 @@ def normal_consistency(depth: Tensor, normal: Tensor, alpha: Tensor, K: Tensor, 
     It is differentiable, once, in ``depth`` and ``normal``.
 
     depth: [H, W], 0 where unknown. normal: [H, W, 3], camera space. alpha: [H, W], held constant. All float32 or all
-    float64, on the CPU or on one GPU. K: [3, 3], pixels; it is read on the host. See ``losses.normal`` for what counts.
-    Bit for bit the same for any number of threads, and in every run on one GPU.
+    float64, on the CPU or on one GPU. K: [3, 3], pixels; it is read on the host. ``losses.normal`` says which pixels
+    count. The result has the same bits for any number of threads, and in every run on one GPU.
     """
     shape, dtype = tuple(depth.shape), depth.dtype
     if len(shape) != 2:
@@ -33,33 +33,33 @@ class _NormalConsistency(torch.autograd.Function):
         d, n = depth.detach().contiguous(), normal.detach().contiguous()
         height, width = d.shape
         scale = weight / max((height - 2) * (width - 2), 1) if min(height, width) > 2 else weight
-        found = (torch.empty_like(d), torch.empty_like(n)) if any(ctx.needs_input_grad) else (None, None)
-        intrinsics = (K[0][0], K[1][1], K[0][1], K[0][2], K[1][2])
-        if found[0] is not None:
-            ctx.save_for_backward(*found)
+        gradients = (torch.empty_like(d), torch.empty_like(n)) if any(ctx.needs_input_grad) else (None, None)
+        numbers = (K[0][0], K[1][1], K[0][1], K[0][2], K[1][2], scale)
+        if gradients[0] is not None:
+            ctx.save_for_backward(*gradients)
         module = cuda_extension.module_for(d, n, alpha)
         if module is not None:
-            return _on_gpu(module, (d, n, alpha), (*intrinsics, scale), found)
-        total = extension.function("normal_consistency", d)(
-            d, n, alpha, *intrinsics, scale, *found, extension.threads()
-        )
-        return d.new_full((), scale * total)
+            return _on_gpu(module, (d, n, alpha), numbers, gradients)
+        compute = extension.function("normal_consistency", d)
+        return d.new_full((), scale * compute(d, n, alpha, *numbers, *gradients, extension.threads()))
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grad_outputs: Tensor):
         depth, normal = ctx.saved_tensors
         wanted, (factor,) = ctx.needs_input_grad, grad_outputs
-        found_depth = extension.scaled(depth, factor) if wanted[0] else None
-        return found_depth, extension.scaled(normal, factor) if wanted[1] else None, None
+        to_depth = extension.scaled(depth, factor) if wanted[0] else None
+        return to_depth, extension.scaled(normal, factor) if wanted[1] else None, None
 
 
-def _on_gpu(module, images: tuple[Tensor, ...], numbers: tuple[float, ...], found: tuple[Tensor | None, ...]) -> Tensor:
-    """Return the value as a scalar on the GPU, which the host does not wait for; fills the gradients in ``found``."""
+def _on_gpu(
+    module, images: tuple[Tensor, ...], numbers: tuple[float, ...], gradients: tuple[Tensor | None, ...]
+) -> Tensor:
+    """Return the value as a scalar on the GPU, which the host does not wait for; fills ``gradients``."""
     depth = images[0]
-    shares = None if found[0] is None else depth.new_empty(4, *depth.shape)
+    shares = None if gradients[0] is None else depth.new_empty(4, *depth.shape)
     blocks = -(-depth.numel() // module.NORMAL_THREADS)
     sums = torch.empty(blocks, dtype=torch.float64, device=depth.device)
     value = depth.new_empty(1)
-    cuda_extension.call(module, "normal_consistency", depth, *images, *numbers, *found, shares, sums, value)
+    cuda_extension.call(module, "normal_consistency", depth, *images, *numbers, *gradients, shares, sums, value)
     return value[0]

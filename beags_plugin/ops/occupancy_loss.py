@@ -24,13 +24,13 @@ def occupancy_loss(
 ) -> Tensor:
     """Return weight * L_occ (E9), a scalar; differentiable, once, in the four parameters.
 
-    Its memory does not depend on ``samples``.
+    Its memory does not grow with ``samples``.
 
     means [N, 3], quats [N, 4] wxyz, log_scales [N, 2], opacity_logits [N]: as in ``core.surfels.Surfels``; float32 or
         float64, on the CPU or a GPU. Surfels with a parameter that is not finite, or with a scale of 0, count as 0.
     class_ids: [N] int32, phi.
-    lookup: of the visibility grid.
-    stream: 64 bits that decide the random points: ``occupancy.sampling.sample_stream`` of seed and step.
+    lookup: that of the visibility grid.
+    stream: 64 bits that decide the random points, from ``occupancy.sampling.sample_stream``.
     samples: Z, points per Gaussian.
     background: whether the Gaussians of class 0 take part.
     """

@@ -17,8 +17,8 @@ def photometric(
     It is differentiable, once, in ``image``.
 
     image, reference: [H, W, 3], both float32 or both float64, on the CPU or on one GPU. c1, c2: the constants of SSIM.
-    The window has 11 pixels, sigma 1.5, and zeros outside the image. Bit for bit the same for any number of threads,
-    and in every run on one GPU.
+    The window has 11 pixels, sigma 1.5, and zeros outside the image. The result has the same bits for any number of
+    threads, and in every run on one GPU.
     """
     shape = tuple(image.shape)
     if len(shape) != 3 or shape[2] != 3 or 0 in shape:

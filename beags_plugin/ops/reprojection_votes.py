@@ -24,20 +24,21 @@ def reprojection_votes(
 
     depths: V x [H, W], float32 or float64, on the CPU or a GPU, all of one dtype. labels: V x [H, W] int32 or uint8,
         None: no mask; ids that are not 0 .. num_classes - 1 do not vote, nor does 255 of a uint8 map.
-    own: T x [H, W] int32, what the views that are voted on were; None: no mask.
+    own: T x [H, W] int32, the labels to vote on; None: no mask.
     maps: [T, V, 12] of the same dtype, on the CPU, from view v to view first + t: A row-major, then b; a pixel (x, y)
         at depth d projects to d A (x, y, 1) + b = z (x', y', 1).
     tau: a vote counts where |z - D| <= tau z; infinity: everywhere. ignore: label of views without a mask.
-    Returns T x [H, W] int32 and T x [H, W] float32. Each thread, or the GPU, takes H W num_classes counters of 4 bytes.
+    Returns the labels, T x [H, W] int32, and their shares of the votes, T x [H, W] float32. Each thread, or the GPU,
+    takes H W num_classes counters of 4 bytes.
     """
     dtype = depths[0].dtype
     depths = [extension.plain(f"depths[{v}]", d, (d.shape[0], d.shape[1]), dtype) for v, d in enumerate(depths)]
-    masks = [
-        None if mask is None else extension.plain(f"labels[{v}]", mask, tuple(depths[v].shape), _type_of(mask))
-        for v, mask in enumerate(labels)
-    ]
-    wide = [mask if mask is not None and mask.dtype == torch.int32 else None for mask in masks]
-    narrow = [mask if mask is not None and mask.dtype == torch.uint8 else None for mask in masks]
+    wide: list[Tensor | None] = [None] * len(labels)
+    narrow: list[Tensor | None] = [None] * len(labels)
+    for v, mask in enumerate(labels):
+        if mask is not None:
+            of_type, dtype_of_labels = (narrow, mask.dtype) if mask.dtype == torch.uint8 else (wide, torch.int32)
+            of_type[v] = extension.plain(f"labels[{v}]", mask, tuple(depths[v].shape), dtype_of_labels)
     maps = extension.plain("maps", maps, (len(maps), len(depths), 12), dtype)
     voted, confidence = [], []
     for view, mask in zip(range(first, first + len(maps)), own, strict=True):
@@ -53,7 +54,3 @@ def reprojection_votes(
     else:
         extension.function("reprojection_votes", maps)(*arguments, extension.threads())
     return voted, confidence
-
-
-def _type_of(mask: Tensor) -> torch.dtype:
-    return torch.uint8 if mask.dtype == torch.uint8 else torch.int32

@@ -13,8 +13,8 @@ def sh_colors(sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_center: Tens
     """Return the colour of each surfel as seen from ``camera_center``: SH + 0.5, clamped at 0; [N, 3].
 
     sh_dc: [N, 3], degree 0. sh_rest: [N, K, 3], the others, K >= (degree + 1)^2 - 1. means: [N, 3] world.
-    camera_center: [3] world, without gradient, quicker on the CPU. degree: 0..3. All float32 or all float64, on the
-    CPU or a GPU; differentiable, once, in ``sh_dc``, ``sh_rest`` and ``means``.
+    camera_center: [3] world, without gradient, read faster from the CPU. degree: 0..3. All float32 or all float64, on
+    the CPU or a GPU; differentiable, once, in ``sh_dc``, ``sh_rest`` and ``means``.
     """
     n, dtype = len(sh_dc), sh_dc.dtype
     if not 0 <= degree <= 3:
@@ -50,11 +50,10 @@ class _Colors(torch.autograd.Function):
         plain = [value.contiguous() for value in ctx.saved_tensors]
         dc, rest, means = ctx.needs_input_grad[:3]
         wanted = (dc, rest, means and degree > 0)
-        found = [torch.empty_like(value) if want else None for value, want in zip(plain, wanted, strict=True)]
+        gradients = [torch.empty_like(value) if want else None for value, want in zip(plain, wanted, strict=True)]
+        arguments = (*plain, center, degree, clamped, grad_outputs[0].contiguous(), *gradients)
         if any(wanted) and module is not None:
-            arguments = (*plain, center, degree, clamped, grad_outputs[0].contiguous(), *found)
             cuda_extension.call(module, "sh_colors_backward", plain[2], *arguments)
         elif any(wanted):
-            backward = extension.function("sh_colors_backward", plain[2])
-            backward(*plain, center, degree, clamped, grad_outputs[0].contiguous(), *found, extension.threads())
-        return *found, None, None
+            extension.function("sh_colors_backward", plain[2])(*arguments, extension.threads())
+        return *gradients, None, None

@@ -11,9 +11,9 @@ from beags_plugin.ops import extension
 
 
 class SparseSums:
-    """Adds up values per key in float64, in the order in which they come; memory is linear in the keys that occurred.
+    """Adds up values per key in float64, in the order of the calls; memory is linear in the keys that occurred.
 
-    Time of a call is linear in the keys so far and the new ones.
+    The time of a call is linear in the former keys and the new ones.
     """
 
     def __init__(self) -> None:
@@ -25,7 +25,7 @@ class SparseSums:
         values = extension.plain("values", values, (len(keys),), values.dtype)
         extension.function("add", values, self._native)(keys, values)
 
-    def found(self) -> tuple[Tensor, Tensor]:
+    def totals(self) -> tuple[Tensor, Tensor]:
         """Return the keys [K] int64, ascending, and their sums [K] float64."""
         keys = torch.empty(self._native.count, dtype=torch.int64)
         sums = torch.empty(len(keys), dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Tables of ``native/ops/voxel_table.h``, made where the voxels lie: on a GPU without a way over the CPU."""
+"""Tables of ``native/ops/voxel_table.h``, built on the device of the voxels: on a GPU without a detour by the CPU."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from torch import Tensor
 
 from beags_plugin.ops import cuda_extension
 
-_BITS, _SHIFT = 21, 8  # of an axis in a voxel's key; kVoxelShift - kVoxelHalf of voxel_table.h
-_MOST_DENSE, _DENSE_PER_BRICK = 1 << 16, 16  # as voxel_lookup.cpp
+_BITS, _SHIFT = 21, 8  # bits of an axis in a voxel's key; kVoxelShift - kVoxelHalf of voxel_table.h
+_MOST_DENSE, _DENSE_PER_BRICK = 1 << 16, 16  # the limits of voxel_lookup.cpp
 _MOST_CELLS = 1 << 62
-# A brick's bit 16 x + 4 y + z: one step along an axis is a shift; those whose place along it is 0. As signed numbers.
+# Bit 16 x + 4 y + z of a brick is its voxel (x, y, z). Per axis: the shift that is one step along it, and the voxels
+# whose coordinate along it is 0.
 _STEPS = (16, 4, 1)
 _FIRST = (0xFFFF, 0x000F000F000F000F, 0x1111111111111111)
 
@@ -22,8 +23,8 @@ _FIRST = (0xFFFF, 0x000F000F000F000F, 0x1111111111111111)
 def tables(module: ModuleType, keys: Tensor, ranks: Tensor, classes: int) -> tuple[list[Any], list[Any]] | None:
     """Make tables of occupied voxels and of the corners of cubes of 1, 2 and 3 valid voxels; return their memory too.
 
-    The same sets as ``VoxelLookup`` of ``native/`` makes, bit for bit. None where the box about the voxels is too large
-    for bricks to be numbered in 63 bits.
+    The sets are those of ``VoxelLookup`` in ``native/``, bit for bit. Returns None where the box of the voxels is too
+    large for its bricks to be numbered in 63 bits.
 
     module: CUDA's. keys: [M] int64, different for each class; ranks: [M] int32 in 0 .. classes - 1.
     """
@@ -33,22 +34,22 @@ def tables(module: ModuleType, keys: Tensor, ranks: Tensor, classes: int) -> tup
     sets = [occupied, _each_axis(occupied, _spread)]
     for _ in range(2):
         sets.append(_each_axis(sets[-1], _corners))
-    found, memory = [], []
+    made, memory = [], []
     for bricks in sets:
         base, size, dense = _dense(bricks)
         parts = [dense, None, None] if dense is not None else [None, *_hashed(module, bricks)]
         memory.append(parts)
-        there = [None if part is None else part.view(torch.uint8).reshape(-1) for part in parts]
-        found.append(module.VoxelTable(classes, base, size, *there))
-    return found, memory
+        flat = [None if part is None else part.view(torch.uint8).reshape(-1) for part in parts]
+        made.append(module.VoxelTable(classes, base, size, *flat))
+    return made, memory
 
 
 @dataclass(frozen=True)
 class _Bricks:
     """Bricks with a voxel, of all classes, sorted by their number ((rank X + x) Y + y) Z + z within a box.
 
-    numbers, bits: [B] int64. base: the box's first brick; size: X, Y, Z. Along each axis the box has two empty bricks
-    at either end, so that neighbours have numbers.
+    numbers, bits: [B] int64. base: the box's first brick; size: X, Y, Z. Two empty bricks at either end of each axis
+    give numbers to all neighbours.
     """
 
     numbers: Tensor
@@ -82,17 +83,17 @@ def _occupied(keys: Tensor, ranks: Tensor, classes: int) -> _Bricks | None:
         numbers = numbers * size[axis] + (places[:, axis] - base[axis])
     numbers, inverse = torch.unique(numbers, return_inverse=True)
     cells = within[:, 0] * 16 + within[:, 1] * 4 + within[:, 2]
-    # Voxels of a brick are different, so that the sum of their bits is all of them.
+    # The voxels of a brick are distinct, so the sum of their bits is their union.
     bits = torch.zeros_like(numbers).index_add_(0, inverse, torch.ones_like(cells) << cells)
     return _Bricks(numbers, bits, classes, base, size)
 
 
 def _each_axis(bricks: _Bricks, change: Any) -> _Bricks:
-    """Apply ``change(bricks, axis)`` along one axis after the other, without the bricks that become empty."""
+    """Apply ``change(bricks, axis)`` along one axis after the other; drop the bricks that become empty."""
     for axis in range(3):
         numbers, bits = change(bricks, axis)
-        kept = bits != 0
-        bricks = _Bricks(numbers[kept], bits[kept], bricks.classes, bricks.base, bricks.size)
+        nonempty = bits != 0
+        bricks = _Bricks(numbers[nonempty], bits[nonempty], bricks.classes, bricks.base, bricks.size)
     return bricks
 
 
@@ -107,13 +108,13 @@ def _spread(bricks: _Bricks, axis: int) -> tuple[Tensor, Tensor]:
     )
     numbers, inverse = torch.unique(torch.cat([number for number, _ in parts]), return_inverse=True)
     united = torch.zeros_like(numbers)
-    for at, (_, part) in zip(inverse.view(3, -1), parts, strict=True):  # in each part, no number comes twice
+    for at, (_, part) in zip(inverse.view(3, -1), parts, strict=True):  # No part holds a number twice.
         united[at] |= part
     return numbers, united
 
 
 def _corners(bricks: _Bricks, axis: int) -> tuple[Tensor, Tensor]:
-    """Return the voxels whose next one is there too."""
+    """Return the voxels whose next one along the axis is in the set too."""
     step, first = _STEPS[axis], _FIRST[axis]
     last, bits = _signed(first << 3 * step), bricks.bits
     if len(bits) == 0:
@@ -141,11 +142,11 @@ def _dense(bricks: _Bricks) -> tuple[list[int], list[int], Tensor | None]:
 
 
 def _hashed(module: ModuleType, bricks: _Bricks) -> tuple[Tensor, Tensor]:
-    """Return the slots of all classes [S, 2] and where each class has its own [classes, 3], as ``BrickRange``."""
+    """Return the slots of all classes [S, 2] and the range of each class in them [classes, 3], as ``BrickRange``."""
     ranks, places = bricks.ranks(), bricks.places()
     first, rows = 0, []
     for count in torch.bincount(ranks, minlength=bricks.classes).tolist():
-        bits = max(2 * count - 1, 1).bit_length()  # at most half full: short chains
+        bits = max(2 * count - 1, 1).bit_length()  # Tables at most half full have short chains.
         rows.append((first, (1 << bits) - 1, 64 - bits))
         first += 1 << bits
     ranges = torch.tensor(rows, dtype=torch.int64, device=ranks.device)
@@ -159,6 +160,6 @@ def _hashed(module: ModuleType, bricks: _Bricks) -> tuple[Tensor, Tensor]:
 
 
 def _signed(bits: int) -> int:
-    """Return 64 bits as the int64 that has them."""
+    """Return the int64 of these 64 bits."""
     bits &= (1 << 64) - 1
     return bits - (1 << 64) if bits >> 63 else bits

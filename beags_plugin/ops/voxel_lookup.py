@@ -15,8 +15,8 @@ from beags_plugin.ops import cuda_extension, extension, voxel_bricks
 class VoxelLookup:
     """The occupied voxels of all classes, and the valid ones (next to an occupied one), as hashed 4 x 4 x 4 bricks.
 
-    Memory is linear in the occupied voxels. Class ids that are no class of the grid have no voxels. Queries are
-    answered where their points lie, on the CPU or a GPU, from tables that are made there when they are first needed.
+    Memory is linear in the occupied voxels. Class ids that are no class of the grid have no voxels. Queries run on the
+    device of their points, the CPU or a GPU, whose tables are built by the first query.
 
     keys: [M] int64, sorted; classes: [M] int32; origin: [3] float64, world; voxel_size: world units; all as in
         ``occupancy.grid.VisibilityGrid``, on any device.
@@ -52,38 +52,32 @@ class VoxelLookup:
         return self._voxels[key][0]
 
     def _copied(self, module: ModuleType, device: torch.device) -> tuple[list[Any], list[Any]]:
-        """Return the CPU's tables there, for voxels too far apart to be numbered."""
+        """Return the CPU's tables copied to ``device``, for voxels too far apart to be numbered."""
         memory, tables = [], []
         for classes, base, size, *parts in self.native.tables():
-            there = [
-                torch.frombuffer(bytearray(part), dtype=torch.uint8).to(device) if part else None for part in parts
-            ]
-            memory.append(there)
-            tables.append(module.VoxelTable(classes, base, size, *there))
+            memory.append(
+                [torch.frombuffer(bytearray(part), dtype=torch.uint8).to(device) if part else None for part in parts]
+            )
+            tables.append(module.VoxelTable(classes, base, size, *memory[-1]))
         return tables, memory
 
     def ranks(self, class_ids: Tensor) -> Tensor:
         """Return the classes as ``native`` numbers them: [N] int32, background 0. class_ids: [N] int32."""
         return self._ranks.ranks(class_ids)
 
-    @property
-    def bytes(self) -> int:
-        """Return the memory of the CPU's tables."""
-        return self.native.bytes
-
     def count(self, points: Tensor, class_ids: Tensor) -> Tensor:
         """Return D_occ, [P] int64 in 0..27. points: [P, 3] float32 or float64, world; class_ids: [P] int."""
-        return self._ask("count", torch.int64, class_ids, points=points)
+        return self._query("count", torch.int64, class_ids, points=points)
 
     def valid(self, points: Tensor, class_ids: Tensor) -> Tensor:
         """Return D_occ > 0, [P] bool; arguments as of ``count``."""
-        return self._ask("valid", torch.bool, class_ids, points=points)
+        return self._query("valid", torch.bool, class_ids, points=points)
 
     def disc_inside(self, means: Tensor, axes_u: Tensor, axes_v: Tensor, class_ids: Tensor) -> Tensor:
         """Return the discs that surely lie in valid voxels, [N] bool; arguments as ``VisibilityGrid.disc_inside``."""
-        return self._ask("disc_inside", torch.bool, class_ids, means=means, axes_u=axes_u, axes_v=axes_v)
+        return self._query("disc_inside", torch.bool, class_ids, means=means, axes_u=axes_u, axes_v=axes_v)
 
-    def _ask(self, name: str, dtype: torch.dtype, class_ids: Tensor, **vectors: Tensor) -> Tensor:
+    def _query(self, name: str, dtype: torch.dtype, class_ids: Tensor, **vectors: Tensor) -> Tensor:
         first = next(iter(vectors.values()))
         count = len(first)
         arrays = [extension.plain(key, value, (count, 3), first.dtype) for key, value in vectors.items()]

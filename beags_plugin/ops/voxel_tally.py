@@ -11,15 +11,15 @@ from torch import Tensor
 from beags_plugin.ops import cuda_extension, extension
 
 _LEAST = 1 << 10  # slots
-_NONE = -1  # every bit is set: what an empty slot holds
+_NONE = -1  # value of an empty slot: every bit is set
 
 
 class VoxelTally:
-    """Two hash tables, which grow: voxels with one class each, and further classes of voxels. Counts are exact.
+    """Two growing hash tables: voxels with one class each, and further classes of voxels. Counts are exact.
 
     Memory is linear in the voxels: 20 bytes a slot, 16 for one of a further class, at least twice as many slots as are
-    used or as one call may add. A call that may need more memory waits for the GPU, to see how many slots are used. The
-    order of classes in memory depends on chance; no result does.
+    used or as one call may add. A call that may need more memory waits for the GPU to report the used slots. The order
+    of classes in memory varies between runs; no result does.
 
     module: ``cuda_extension.load()``. device: where the memory lies.
     """
@@ -27,7 +27,7 @@ class VoxelTally:
     def __init__(self, module: ModuleType, device: torch.device) -> None:
         self._module, self._device = module, device
         self._used = torch.zeros(3, dtype=torch.int32, device=device)
-        self._most = [0, 0]  # voxels and further classes, no fewer than there are
+        self._most = [0, 0]  # upper bounds of the numbers of voxels and of further classes
         self._make(_LEAST, _LEAST)
 
     def add_pixels(self, depth: Tensor, to_voxels: Tensor, labels: Tensor, ignore: int) -> None:
@@ -38,7 +38,8 @@ class VoxelTally:
     def add_points(self, points: Tensor, class_ids: Tensor, origin: Tensor, size: float) -> None:
         """Add one vote of each point [P, 3] float for its class [P] int32, in the voxel floor((point - origin) / size).
 
-        Points that are not finite, or 2^20 voxels or more from the origin along an axis, do not vote: ``all_near``.
+        Points that are not finite, or 2^20 voxels or more from the origin along an axis, do not vote; ``all_near``
+        tells whether there were any.
         """
         points = extension.plain("points", points, (len(points), 3), points.dtype)
         class_ids = extension.plain("class_ids", class_ids, (len(points),), torch.int32)
@@ -58,7 +59,7 @@ class VoxelTally:
         return keys, labels[alone][order]
 
     def decide(self) -> None:
-        """End the votes; ``read`` may be called from now on."""
+        """Decide each voxel; call it after all votes and before ``read``."""
         slots = len(self._memory[0])
         self._decided = [torch.empty(slots, dtype=torch.int32, device=self._device) for _ in range(2)]
         self._tally = self._module.VoxelTally(*self._memory, *self._decided)
@@ -85,20 +86,15 @@ class VoxelTally:
         slots = (len(self._memory[0]), len(self._memory[4]))
         if any(2 * (most + votes) > there for most, there in zip(self._most, slots, strict=True)):
             self._most = self._used[:2].tolist()
-            wanted = [
-                max(_power_of_two(2 * (most + votes)), there) for most, there in zip(self._most, slots, strict=True)
-            ]
+            needed = [1 << (2 * (most + votes) - 1).bit_length() for most in self._most]  # Sizes are powers of two.
+            wanted = [max(pair) for pair in zip(needed, slots, strict=True)]
             if wanted != list(slots):
-                before, kept = self._tally, self._memory
-                self._used = torch.where(torch.arange(3, device=self._device) == 2, kept[7], 0)
+                former, memory = self._tally, self._memory  # The memory must outlive the move.
+                self._used = torch.where(torch.arange(3, device=self._device) == 2, memory[7], 0)
                 self._make(*wanted)
-                self._call("move_votes", before, self._tally)
+                self._call("move_votes", former, self._tally)
         self._most = [most + votes for most in self._most]
 
     def _call(self, name: str, *arguments: Any) -> None:
         with cuda_extension.on_device(self._device):
             getattr(self._module, name)(*arguments, cuda_extension.stream(self._device))
-
-
-def _power_of_two(least: int) -> int:
-    return 1 << max(least - 1, 1).bit_length()

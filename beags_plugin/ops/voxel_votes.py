@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -14,82 +13,65 @@ from beags_plugin.ops.voxel_tally import VoxelTally
 
 
 class VoxelVotes:
-    """Counts votes per (voxel, class), then gives each pixel the class that leads about its point.
+    """Counts votes per (voxel, class), then gives each pixel the class that leads around its point.
 
     A pixel (x, y) at depth d lies at d A (x, y, 1) + b, in voxels; ``to_voxels`` [13] is A row by row, b, and the depth
-    of one of the ``masks.pooled_votes.LOOKS``' steps. Pixels whose depth is not positive and finite, or whose point is
-    2^20 - 8 voxels or more from 0 along an axis, neither vote nor get an answer. For the reading of votes see
-    ``masks.voxel_reprojection``. Memory is linear in the voxels; the number of classes costs neither time nor memory.
+    of one step of ``masks.pooled_votes.LOOKS``. Pixels whose depth is not positive and finite, or whose point is
+    2^20 - 8 voxels or more from 0 along an axis, neither vote nor get an answer. ``masks.voxel_reprojection`` describes
+    how votes are read. Memory is linear in the voxels; the number of classes costs neither time nor memory.
 
-    ignore: the label that does not vote.
+    ignore: the label that does not vote. tally: memory on a GPU that then holds all tensors but ``to_voxels``, or None
+        for the CPU. The results are the same.
     """
 
-    def __init__(self, ignore: int) -> None:
-        self._native: Any = extension.module().VoxelVotes(extension.threads())
-        self._ignore = ignore
+    def __init__(self, ignore: int, tally: VoxelTally | None = None) -> None:
+        self._ignore, self._tally = ignore, tally
+        self._native: Any = extension.module().VoxelVotes(extension.threads()) if tally is None else None
 
     def add(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> None:
         """Add one vote of each pixel. depth: [H, W] float32 or float64; labels: [H, W] int32, 0 or more."""
         depth, to_voxels = _view(depth, to_voxels)
         labels = extension.plain("labels", labels, tuple(depth.shape), torch.int32)
-        extension.function("add", depth, self._native)(depth, to_voxels, labels, self._ignore)
+        if self._tally is not None:
+            self._tally.add_pixels(depth, to_voxels.cpu(), labels, self._ignore)
+        else:
+            extension.function("add", depth, self._native)(depth, to_voxels, labels, self._ignore)
 
     def decide(self) -> None:
-        """End the votes; ``read`` may be called from now on."""
-        self._native.decide()
+        """Decide each voxel; call it after all votes and before ``read``."""
+        (self._tally or self._native).decide()
 
     def read(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the winner about each pixel's point, and its share of the votes.
+        """Return the class that leads around each pixel's point, and its share of the votes.
 
-        A pixel keeps its label where several classes lead or nobody voted. The share is of the votes in the voxel of
-        the point, or if nobody voted there of those that were read.
+        A pixel keeps its label where several classes lead or there are no votes. The share is that of the votes in the
+        voxel of the point, or, if it has none, of the votes that were read.
 
         depth: [H, W] float. labels: [H, W] int32.
-        Returns [H, W] int32 and [H, W] float32 (0 where nobody voted).
+        Returns [H, W] int32 and [H, W] float32 (0 where there are no votes).
         """
         depth, to_voxels = _view(depth, to_voxels)
         labels = extension.plain("labels", labels, tuple(depth.shape), torch.int32).clone()
+        if self._tally is not None:
+            return labels, self._tally.read(depth, to_voxels.cpu(), labels)
         confidence = torch.empty(tuple(depth.shape), dtype=torch.float32)
         extension.function("read", depth, self._native)(depth, to_voxels, labels, confidence)
         return labels, confidence
 
 
-class CudaVoxelVotes:
-    """``VoxelVotes`` on a GPU, with the same results: its arguments and results lie there, but for ``to_voxels``."""
-
-    def __init__(self, ignore: int, module: ModuleType, device: torch.device) -> None:
-        self._tally, self._ignore = VoxelTally(module, device), ignore
-
-    def add(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> None:
-        """See ``VoxelVotes.add``."""
-        depth, to_voxels = _view(depth, to_voxels)
-        labels = extension.plain("labels", labels, tuple(depth.shape), torch.int32)
-        self._tally.add_pixels(depth, to_voxels.cpu(), labels, self._ignore)
-
-    def decide(self) -> None:
-        """See ``VoxelVotes.decide``."""
-        self._tally.decide()
-
-    def read(self, depth: Tensor, to_voxels: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """See ``VoxelVotes.read``."""
-        depth, to_voxels = _view(depth, to_voxels)
-        labels = extension.plain("labels", labels, tuple(depth.shape), torch.int32).clone()
-        return labels, self._tally.read(depth, to_voxels.cpu(), labels)
-
-
 def brick_sample(depth: Tensor, to_voxels: Tensor, part: int) -> Tensor:
     """Sample depth [H, W] on the CPU as ``masks.spatial_chunks.torch_brick_sample``.
 
-    The caller asks ``extension.supports(depth)`` first."""
+    The caller checks ``extension.supports(depth)`` first."""
     depth, to_voxels = _view(depth, to_voxels)
-    found = extension.function("brick_sample", depth)(depth, to_voxels, part)
-    return torch.tensor(found, dtype=torch.int64).reshape(-1, 3)
+    bricks = extension.function("brick_sample", depth)(depth, to_voxels, part)
+    return torch.tensor(bricks, dtype=torch.int64).reshape(-1, 3)
 
 
-def votes_for(depths: Sequence[Tensor], ignore: int) -> VoxelVotes | CudaVoxelVotes | None:
+def votes_for(depths: Sequence[Tensor], ignore: int) -> VoxelVotes | None:
     """Return the compiled counter of votes for depths on this device; None if there is none."""
     if (module := cuda_extension.module_for(*depths)) is not None:
-        return CudaVoxelVotes(ignore, module, depths[0].device)
+        return VoxelVotes(ignore, VoxelTally(module, depths[0].device))
     return VoxelVotes(ignore) if extension.supports(*depths) else None
 
 

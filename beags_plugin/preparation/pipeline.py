@@ -33,8 +33,8 @@ from beags_plugin.preparation.consistent_masks import (
 )
 from beags_plugin.preparation.refiner import AssignedScene, Refiner
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
-from beags_plugin.rasterizers.rendering import check_surface_depth
-from beags_plugin.system.errors import UserError
+from beags_plugin.rasterizers.rendering import SURFACE_DEPTHS
+from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.filed_tensors import filed
 from beags_plugin.system.progress import timed
 
@@ -67,7 +67,7 @@ class PreparationConfig:
         REPROJECTIONS.check(self.reprojection, AUTO, "none")
         if self.reprojection not in (AUTO, "none"):
             REPROJECTIONS.get(self.reprojection)  # Another package's may fail to load.
-        check_surface_depth(self.depth)
+        check_choice(self.depth, SURFACE_DEPTHS, "surface depth")
         if not self.tau >= 0:
             raise UserError(f"tau is {self.tau}: it must be 0 or more (inf counts every vote).")
         if not self.k >= 1:

@@ -22,9 +22,9 @@ _PREFERENCE = ("native", "torch")  # what "auto" tries, best first; on a GPU fir
 def make_rasterizer(name: str = "auto") -> Rasterizer:
     """Return the backend called ``name``; raises ``UserError`` if it cannot run here.
 
-    "auto" takes the best one for the CPU. Where there is a GPU, tensors that lie there go to the CUDA backend, or if
-    that cannot run, or has failed its trial (``first_contact``), to the torch one, for nerfstudio's commands load a run
-    onto any GPU.
+    "auto" uses the best backend for the CPU. Where there is a GPU, its tensors go to the CUDA backend, or, if that
+    cannot run or has failed its trial (``first_contact``), to the torch backend, because nerfstudio's commands load a
+    run onto any GPU.
     """
     if name != "auto":
         backend = RASTERIZERS.get(name)
@@ -36,7 +36,7 @@ def make_rasterizer(name: str = "auto") -> Rasterizer:
         if backend.unavailable() is None:
             on_gpu = RASTERIZERS.get("cuda")
             if on_gpu.unavailable() is None:
-                first_contact.settle()  # makes it unavailable where it cannot be trusted
+                first_contact.settle()  # The backend becomes unavailable if it fails its trial.
             if on_gpu.unavailable() is not None:
                 import torch
 

@@ -1,4 +1,4 @@
-"""One autograd function for every backend that brings a forward and a backward kernel."""
+"""One autograd function for every backend that has a forward and a backward kernel."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from beags_plugin.rasterizers.interface import FLOATS, Rasterizer, RasterOutputs
 
 
 class Images(NamedTuple):
-    """The float images of ``RasterOutputs`` (names, shapes, dtypes), or gradients towards them; None: absent."""
+    """The float images of ``RasterOutputs`` (names, shapes, dtypes), or gradients of the loss in them; None: absent."""
 
     color: Tensor | None
     alpha: Tensor | None
@@ -28,7 +28,7 @@ class Images(NamedTuple):
 
 
 class InputGradients(NamedTuple):
-    """Gradients towards the float fields of ``SurfelInputs`` and the background, shaped as these; None: not needed."""
+    """Gradients of the float fields of ``SurfelInputs`` and of the background, in their shapes; None: not needed."""
 
     means: Tensor | None
     quats: Tensor | None
@@ -41,12 +41,12 @@ class InputGradients(NamedTuple):
 
 @dataclass(frozen=True)
 class RenderCall:
-    """One render: tensors are checked and contiguous, and autograd records nothing that is done with them.
+    """One render: its tensors are checked and contiguous, and autograd does not record operations on them.
 
     inputs, camera, settings: as in ``Rasterizer.rasterize``.
     background: [3] of the inputs' dtype.
     target: [H, W] int32 class ids or IGNORE, or None: no boundary.
-    differentiable: whether a backward may follow; if not, the forward need not keep anything for it.
+    differentiable: whether a backward may follow; if not, the forward need not save anything for it.
     """
 
     inputs: SurfelInputs
@@ -62,7 +62,7 @@ class RenderCall:
         return self.inputs.means.new_empty(shape, dtype=dtype) if wanted else None
 
     def empty_images(self) -> Images:
-        """Return memory for the images that the settings and the target ask for."""
+        """Return memory for the images that the settings and the target request."""
         geometry = self.settings.geometry
         return Images(
             color=self.empty_image(True, 3),
@@ -76,7 +76,7 @@ class RenderCall:
 
 
 class Forward(NamedTuple):
-    """A forward kernel's result: the images, visible [N] bool, num_nonfinite, and a state for its own backward."""
+    """A forward kernel's result: the images, visible [N] bool, num_nonfinite, and a state for its backward."""
 
     images: Images
     visible: Tensor
@@ -100,7 +100,7 @@ class KernelRasterizer(Rasterizer):
 
     @abstractmethod
     def forward_kernel(self, call: RenderCall) -> Forward:
-        """Render. Images that neither the settings nor the target ask for are None."""
+        """Render; images that neither the settings nor the target request are None."""
 
     @abstractmethod
     def backward_kernel(
@@ -119,7 +119,6 @@ class KernelRasterizer(Rasterizer):
         background: Tensor,
         target: Tensor | None = None,
     ) -> RasterOutputs:
-        """See ``Rasterizer.rasterize``."""
         inputs = inputs.checked()
         if tuple(background.shape) != (3,) or background.dtype != inputs.means.dtype:
             expected, got = inputs.means.dtype, f"{list(background.shape)} {background.dtype}"
@@ -135,8 +134,8 @@ class KernelRasterizer(Rasterizer):
         if not differentiable:
             images, visible, num_nonfinite, _ = self.forward_kernel(call)
         else:
-            found: Any = _Rasterize.apply(self, call, *floats, inputs.screen_shift, background)
-            *images, visible, num_nonfinite = found
+            results: Any = _Rasterize.apply(self, call, *floats, inputs.screen_shift, background)
+            *images, visible, num_nonfinite = results
         return RasterOutputs(*images, visible=visible, num_nonfinite=num_nonfinite)  # type: ignore
 
 
@@ -144,12 +143,12 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, rasterizer, call, *floats):
         images, visible, num_nonfinite, state = rasterizer.forward_kernel(call)
-        # The inputs are saved through autograd, which notices it if they are changed in place before the backward.
+        # Autograd saves the inputs, so that it notices changes in place before the backward.
         ctx.save_for_backward(*floats)
         ctx.rasterizer, ctx.state = rasterizer, state
-        ctx.call = (call.camera, call.settings, call.target)  # not the inputs: they would live as long
+        ctx.call = (call.camera, call.settings, call.target)  # The inputs would otherwise live as long as ctx.
         ctx.mark_non_differentiable(visible)
-        ctx.set_materialize_grads(False)  # None: the kernel need not compute these
+        ctx.set_materialize_grads(False)  # The kernel skips gradients that are None.
         return *images, visible, num_nonfinite
 
     @staticmethod
@@ -161,5 +160,4 @@ class _Rasterize(torch.autograd.Function):
         images = Images(*[None if g is None else g.contiguous() for g in gradients[:-2]])
         if all(g is None for g in images):
             return (None,) * 9
-        found = ctx.rasterizer.backward_kernel(call, ctx.state, images, ctx.needs_input_grad[2:])
-        return None, None, *found
+        return None, None, *ctx.rasterizer.backward_kernel(call, ctx.state, images, ctx.needs_input_grad[2:])

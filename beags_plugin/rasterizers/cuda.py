@@ -1,10 +1,10 @@
-"""The CUDA rasterizer: checks and allocates here, computes in ``beags_plugin._native.cuda``.
+"""The CUDA rasterizer: it checks and allocates here, and computes in ``beags_plugin._native.cuda``.
 
-All memory is torch's, all kernels run on torch's current stream. The number of pairs (of a tile and a surfel that
-reaches it) is known on the GPU only, so that their memory is guessed from earlier renders. All kernels of a render are
-launched on that guess. Then the host waits for the number, which the GPU knew long before the image, and launches the
-last kernels again in the rare case that the guess was too small. The GPU never waits for the host. In a CUDA graph the
-host does not wait either: there, such a render has no gradients.
+All memory is torch's, all kernels run on torch's current stream. Only the GPU knows the number of pairs (a tile and a
+surfel that reaches it), so their memory is guessed from earlier renders, and all kernels of a render are launched on
+that guess. Then the host waits for the number, which the GPU has long before the image, and launches the last kernels
+again in the rare case that the guess was too small. The GPU never waits for the host. In a CUDA graph the host does not
+wait either: there, such a render has no gradients.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from beags_plugin.rasterizers.autograd import (
 )
 from beags_plugin.rasterizers.interface import FLOATS, RasterSettings, SurfelInputs, map_ids
 from beags_plugin.rasterizers.optional import OptionalProducts
-from beags_plugin.rasterizers.pair_counts import PairCounts, capacity_for
+from beags_plugin.rasterizers.pair_counts import PairCounts, capacity_for, start_copy
 from beags_plugin.rasterizers.rendering import class_channels_by_threes
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 from beags_plugin.system.errors import UserError
@@ -38,7 +38,7 @@ from beags_plugin.system.errors import UserError
 _GEOMETRY, _DISTORTION, _BOUNDARY = 1, 2, 4  # Parts of native/rasterizer/types.h
 _TILE = 16
 UNKNOWN = -1
-"""``num_nonfinite`` of a render in a CUDA graph, which the host does not wait for."""
+"""``num_nonfinite`` of a render in a CUDA graph, whose numbers the host does not wait for."""
 
 
 @dataclass
@@ -46,7 +46,7 @@ class _Frame:
     """Surfels projected and sorted into tiles.
 
     native: the compiled module's frame, which points into ``owned`` (per surfel) and ``pairs`` (per pair).
-    kept: what the forward keeps for the backward.
+    saved: images that the forward saves for the backward.
     """
 
     native: Any
@@ -54,14 +54,14 @@ class _Frame:
     owned: list[Tensor]
     pairs: list[Tensor] = field(default_factory=list)
     num_nonfinite: int = 0
-    kept: tuple[Tensor | None, ...] = ()
+    saved: tuple[Tensor | None, ...] = ()
 
 
 class CudaRasterizer(KernelRasterizer, OptionalProducts):
     """Float32 and float64 on one GPU; the same bits in every run (there are no atomic additions of floats).
 
-    In a CUDA graph (``torch.cuda.graph``) nothing is waited for. Render the same scene once before the capture, so
-    that the memory for its pairs is known, and ask ``overflowed`` after replays.
+    In a CUDA graph (``torch.cuda.graph``) the host waits for nothing. Render the same scene once before the capture, so
+    that the memory for its pairs is known, and check ``overflowed`` after replays.
     """
 
     def __init__(self) -> None:
@@ -71,7 +71,6 @@ class CudaRasterizer(KernelRasterizer, OptionalProducts):
 
     @classmethod
     def unavailable(cls) -> str | None:
-        """See ``Rasterizer.unavailable``."""
         return cuda_extension.status()[1]
 
     def overflowed(self) -> bool:
@@ -83,10 +82,9 @@ class CudaRasterizer(KernelRasterizer, OptionalProducts):
         return self._counts.largest()
 
     def forward_kernel(self, call: RenderCall) -> Forward:
-        """See ``KernelRasterizer.forward_kernel``."""
         like, images = call.inputs.means, call.empty_images()
         geometry = call.differentiable and call.settings.geometry
-        kept = (
+        saved = (
             call.empty_image(call.differentiable),
             call.empty_image(call.differentiable, dtype=torch.int32),
             call.empty_image(geometry),
@@ -95,41 +93,39 @@ class CudaRasterizer(KernelRasterizer, OptionalProducts):
         )
 
         def render(frame: _Frame) -> None:
-            frame.native.forward(call.background, call.target, *images, *kept, self._stream(like))
+            frame.native.forward(call.background, call.target, *images, *saved, self._stream(like))
 
         frame = self._frame(call.inputs, call.camera, call.settings, render)
-        frame.kept = kept
+        frame.saved = saved
         return Forward(images, frame.visible, frame.num_nonfinite, frame)
 
     def backward_kernel(
         self, call: RenderCall, state: Any, gradients: Images, needed: Sequence[bool]
     ) -> InputGradients:
-        """See ``KernelRasterizer.backward_kernel``."""
         floats = [getattr(call.inputs, name) for name in FLOATS]
         like, n = call.inputs.means, len(call.inputs.means)
         *of_inputs, of_background = needed
-        shapes = [*(value.shape for value in floats), (n, 2)]  # the last: of screen_shift
-        found = [like.new_empty(shape) if wanted else None for shape, wanted in zip(shapes, of_inputs, strict=True)]
+        shapes = [*(value.shape for value in floats), (n, 2)]  # The last is that of screen_shift.
+        results = [like.new_empty(shape) if wanted else None for shape, wanted in zip(shapes, of_inputs, strict=True)]
         parts = _GEOMETRY * any(g is not None for g in (gradients.depth, gradients.median_depth, gradients.normal))
         parts |= _DISTORTION * (gradients.distortion is not None) | _BOUNDARY * (gradients.boundary is not None)
         frame: _Frame = state
         capacity = len(frame.pairs[0])
         records = like.new_empty(capacity * frame.native.record_size(parts))
         sums = torch.empty(n, 20, dtype=torch.float64, device=like.device)
-        g_background = like.new_empty(_tiles(call.camera), 3)
+        per_tile = like.new_empty(_tiles(call.camera), 3)
         with cuda_extension.on_device(like.device):
             frame.native.backward(
-                *floats, call.background, call.target, *gradients, *frame.kept, *found, g_background, records, sums,
+                *floats, call.background, call.target, *gradients, *frame.saved, *results, per_tile, records, sums,
                 parts, self._stream(like),
             )  # fmt: skip
-        background = g_background.sum(0, dtype=torch.float64).to(like.dtype) if of_background else None
-        return InputGradients(*found, background)  # type: ignore[call-arg]
+        background = per_tile.sum(0, dtype=torch.float64).to(like.dtype) if of_background else None
+        return InputGradients(*results, background)  # type: ignore[call-arg]
 
     @torch.no_grad()
     def class_contributions(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, labels: Tensor, num_classes: int
     ) -> Tensor:
-        """See ``Rasterizer.class_contributions``."""
         inputs = inputs.checked().detached()
         labels = check_image("labels", labels, camera)
         like = inputs.means
@@ -151,7 +147,7 @@ class CudaRasterizer(KernelRasterizer, OptionalProducts):
         num_classes: int,
         min_weight: float = 0.0,
     ) -> tuple[Tensor, Tensor]:
-        """See ``OptionalProducts.sparse_class_pixel_counts``; without a kernel: the torch reference, on the GPU."""
+        """See ``OptionalProducts.sparse_class_pixel_counts``; the torch reference runs on the GPU."""
         labels = check_image("labels", labels, camera)
         return TorchRasterizer().sparse_class_pixel_counts(inputs, camera, settings, labels, num_classes, min_weight)
 
@@ -165,7 +161,7 @@ class CudaRasterizer(KernelRasterizer, OptionalProducts):
         most: int,
         within: int,
     ) -> tuple[Tensor, Tensor]:
-        """See ``OptionalProducts.sparse_top_contributions``; without a kernel: the torch reference, on the GPU."""
+        """See ``OptionalProducts.sparse_top_contributions``; the torch reference runs on the GPU."""
         labels = check_image("labels", labels, camera)
         what = (inputs, camera, settings, labels, num_classes, most, within)
         return TorchRasterizer().sparse_top_contributions(*what)
@@ -174,7 +170,6 @@ class CudaRasterizer(KernelRasterizer, OptionalProducts):
     def class_map(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
     ) -> tuple[Tensor, Tensor]:
-        """See ``Rasterizer.class_map``."""
         inputs = inputs.checked().detached()
         map_ids(inputs, min(num_classes, IGNORE))
         like = inputs.means
@@ -190,12 +185,11 @@ class CudaRasterizer(KernelRasterizer, OptionalProducts):
     def class_channels(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
     ) -> Tensor:
-        """See ``OptionalProducts.class_channels``; without a kernel: three classes at a time."""
+        """See ``OptionalProducts.class_channels``; there is no kernel: three classes are rendered at a time."""
         return class_channels_by_threes(self, inputs, camera, settings, num_classes)
 
     @torch.no_grad()
     def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
-        """See ``Rasterizer.dominant_gaussian``."""
         inputs = inputs.checked().detached()
         indices = torch.empty(camera.height, camera.width, dtype=torch.int32, device=inputs.means.device)
         stream = self._stream(inputs.means)
@@ -225,27 +219,27 @@ class CudaRasterizer(KernelRasterizer, OptionalProducts):
         if _tiles(camera) > module.MOST_TILES:
             raise UserError(
                 f"an image of {camera.width} x {camera.height} pixels is too large for the CUDA rasterizer, which "
-                "draws 16 million pixels at most: use smaller images."
+                "renders 16 million pixels at most: use smaller images."
             )
         with cuda_extension.on_device(device):
             frame, totals = self._project(module, inputs, camera, settings)
             capturing = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
             counts, place = self._counts, self._counts.place(device)
-            sent = None if capturing else counts.send(totals)
+            wait = None if capturing else start_copy(totals)  # The numbers of pairs and of surfels that are not finite.
             guess = counts.guess(place)
             if guess is None:
-                if sent is None:
-                    raise UserError("draw the scene once before it is captured into a CUDA graph.")
-                first, _ = counts.receive(sent)
+                if wait is None:
+                    raise UserError("render the scene once before it is captured into a CUDA graph.")
+                first, _ = wait()
                 counts.learn(place, first)
                 guess = float(first)
             capacity = self._bin(frame, camera, guess, n)
             render(frame)
-            if sent is None:
+            if wait is None:
                 self._captured.append((totals, capacity))
                 frame.num_nonfinite = UNKNOWN
             else:
-                pairs, frame.num_nonfinite = counts.receive(sent)
+                pairs, frame.num_nonfinite = wait()
                 counts.learn(place, pairs)
                 if pairs > capacity:
                     self._bin(frame, camera, float(pairs), n)
@@ -277,10 +271,10 @@ class CudaRasterizer(KernelRasterizer, OptionalProducts):
         return _Frame(native, visible, owned), totals
 
     def _bin(self, frame: _Frame, camera: Camera, pairs: float, n: int) -> int:
-        """Sort the pairs into tiles; return the number that there is memory for."""
+        """Sort the pairs into tiles; return the number of pairs that the memory holds."""
         capacity = capacity_for(pairs)
         if capacity > 2**31 - 1 or n > 2**31 - 1:
-            raise UserError("over 1.7 billion pairs of a tile and a surfel: draw fewer surfels or smaller images.")
+            raise UserError("over 1.7 billion pairs of a tile and a surfel: render fewer surfels or smaller images.")
         device, module = frame.visible.device, self._native()
 
         def memory(count: int, dtype: torch.dtype = torch.int32) -> Tensor:

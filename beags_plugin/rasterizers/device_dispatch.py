@@ -1,13 +1,23 @@
-"""A rasterizer that renders on the GPU what lies there, and everything else on the CPU."""
+"""A rasterizer that renders Gaussians on the device that holds them: a GPU or the CPU."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from torch import Tensor
-
-from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, SurfelInputs
+from beags_plugin.rasterizers.interface import Rasterizer, SurfelInputs
 from beags_plugin.rasterizers.optional import OptionalProducts, optional_products
+
+
+def _dispatched(name: str) -> Any:
+    """Return a method that calls ``name`` of the backend for the device of its first argument."""
+
+    def call(self: DeviceDispatchRasterizer, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> Any:
+        backend: Any = self.gpu if inputs.means.is_cuda else self.cpu
+        if name in OptionalProducts.__abstractmethods__:
+            backend = optional_products(backend)
+        return getattr(backend, name)(inputs, *args, **kwargs)
+
+    return call
 
 
 class DeviceDispatchRasterizer(Rasterizer, OptionalProducts):
@@ -23,32 +33,12 @@ class DeviceDispatchRasterizer(Rasterizer, OptionalProducts):
     def unavailable(cls) -> str | None:
         return None
 
-    def _backend(self, inputs: SurfelInputs) -> Rasterizer:
-        return self.gpu if inputs.means.is_cuda else self.cpu
-
-    def rasterize(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> RasterOutputs:
-        return self._backend(inputs).rasterize(inputs, *args, **kwargs)
-
-    def class_contributions(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> Tensor:
-        return self._backend(inputs).class_contributions(inputs, *args, **kwargs)
-
-    def sparse_class_contributions(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
-        return self._backend(inputs).sparse_class_contributions(inputs, *args, **kwargs)
-
-    def sparse_class_pixel_counts(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
-        return optional_products(self._backend(inputs)).sparse_class_pixel_counts(inputs, *args, **kwargs)
-
-    def sparse_top_contributions(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
-        return optional_products(self._backend(inputs)).sparse_top_contributions(inputs, *args, **kwargs)
-
-    def class_map(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
-        return self._backend(inputs).class_map(inputs, *args, **kwargs)
-
-    def class_channels(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> Tensor:
-        return optional_products(self._backend(inputs)).class_channels(inputs, *args, **kwargs)
-
-    def feature_channels(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> Tensor | None:
-        return self._backend(inputs).feature_channels(inputs, *args, **kwargs)
-
-    def dominant_gaussian(self, inputs: SurfelInputs, *args: Any, **kwargs: Any) -> Tensor:
-        return self._backend(inputs).dominant_gaussian(inputs, *args, **kwargs)
+    rasterize = _dispatched("rasterize")
+    class_contributions = _dispatched("class_contributions")
+    sparse_class_contributions = _dispatched("sparse_class_contributions")
+    sparse_class_pixel_counts = _dispatched("sparse_class_pixel_counts")
+    sparse_top_contributions = _dispatched("sparse_top_contributions")
+    class_map = _dispatched("class_map")
+    class_channels = _dispatched("class_channels")
+    feature_channels = _dispatched("feature_channels")
+    dominant_gaussian = _dispatched("dominant_gaussian")

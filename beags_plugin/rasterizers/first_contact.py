@@ -1,8 +1,8 @@
-"""Whether the CUDA backend may serve where nobody asked for it by name: it must first agree with the torch reference.
+"""Decide whether "auto" may choose the CUDA backend: it must first agree with the torch reference.
 
-The first time that "auto" would take it on a machine, ``trial`` runs in a process of its own. What comes of it is kept
-for this build on these GPUs with this driver. If it differs, crashes or takes too long, everything runs without it. A
-GPU whose memory others have filled is tried again by the next command.
+The first time that "auto" would choose it on a machine, ``trial`` runs in a process of its own. Its verdict is saved
+for this build, these GPUs and this driver. If results differ, or the trial crashes or takes too long, "auto" does not
+use the backend. A GPU whose memory is full is tried again by the next command.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from beags_plugin.system.digests import content_digest, value_digest
 from beags_plugin.system.whole_files import write_text_atomically
 
 TRUST = "BEAGS_TRUST_CUDA"
-"""Environment variable: with "1", the CUDA backend is taken without a trial."""
+"""Environment variable: with "1", the CUDA backend is used without a trial."""
 
-_FULL = "out of memory"  # in what torch says of a GPU that others have filled
+_FULL = "out of memory"  # words of torch's error for a GPU whose memory is full
 _RAISED = re.compile(r"[\w.]+(Error|Exception)\b")
-_SECONDS = 180.0  # of a trial; most of it goes by while torch is imported and kernels are loaded
+_SECONDS = 180.0  # limit of a trial, most of which goes into importing torch and loading kernels
 _BACKEND = "beags_plugin.rasterizers.cuda:CudaRasterizer"
 _START = "import json, runpy, sys; sys.path[:] = json.loads(sys.argv.pop(1)); "
 _CHILD = _START + "runpy.run_module('beags_plugin.rasterizers.trial', run_name='__main__', alter_sys=True)"
@@ -39,9 +39,10 @@ _CHILD = _START + "runpy.run_module('beags_plugin.rasterizers.trial', run_name='
 
 @dataclass(frozen=True)
 class Verdict:
-    """What came of a trial.
+    """The result of a trial.
 
-    reason: why the CPU serves, the end of a sentence; "" if the backend agrees. gpus: their names. seconds: it took.
+    reason: why the backend must not be used, the end of a sentence; "" if it agrees. gpus: their names. seconds: the
+    trial's time.
     """
 
     reason: str
@@ -51,10 +52,10 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Contact:
-    """A build of the CUDA backend and the GPUs before it.
+    """A build of the CUDA backend and the GPUs that it meets.
 
-    build: digest of the compiled module and its front. gpus: names of all devices. driver: its version. devices: for
-    torch. backend: spec of the rasterizer.
+    build: digest of the compiled module and its front. gpus: names of all devices. driver: its version. devices:
+    torch's names of them. backend: spec of the rasterizer.
     """
 
     build: str
@@ -64,14 +65,10 @@ class Contact:
     backend: str = _BACKEND
 
     def file(self) -> Path:
-        """Return where the verdict on this build, these GPUs and this driver is kept."""
+        """Return the file of the verdict, in ``beags/cuda`` of XDG_CACHE_HOME, else of ~/.cache."""
         key = value_digest([self.build, self.gpus, self.driver])[:24]
-        return cache_folder() / f"{key}.json"
-
-
-def cache_folder() -> Path:
-    """Return the folder of the verdicts: ``beags/cuda`` in XDG_CACHE_HOME, else in ~/.cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "beags" / "cuda"
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+        return cache / "beags" / "cuda" / f"{key}.json"
 
 
 def this_machine() -> Contact | None:
@@ -91,43 +88,43 @@ def this_machine() -> Contact | None:
 
 
 def _driver(cuda_version: int) -> str:
-    """Return the driver's version: Linux's module states it, elsewhere the newest CUDA that it knows stands for it."""
+    """Return the driver's version by Linux's kernel module, elsewhere the newest CUDA that it supports."""
     with suppress(OSError):
         return Path("/proc/driver/nvidia/version").read_text("utf8").splitlines()[0]
     return str(cuda_version)
 
 
 def verdict(contact: Contact, anew: bool = False, say: Callable[[str], None] | None = None) -> Verdict:
-    """Return the kept verdict on a contact; where there is none, or ``anew``, try it (seconds to minutes) and keep it.
+    """Return the saved verdict on a contact; without one, or ``anew``, run the trial (seconds to minutes) and save it.
 
     say: receives a sentence before a trial.
     """
     path = contact.file()
-    if not anew and (kept := _kept(path)) is not None:
-        return kept
+    if not anew and (saved := _saved(path)) is not None:
+        return saved
     if say is not None:
         say(f"First use of {contact.gpus} by this build: its kernels are compared with the torch reference, once.")
     began = time.monotonic()
     reason = try_in_child(contact.backend, contact.devices)
-    found = Verdict(reason, contact.gpus, round(time.monotonic() - began, 1))
+    result = Verdict(reason, contact.gpus, round(time.monotonic() - began, 1))
     if _FULL in reason:
-        return found
-    with suppress(OSError):  # a home that cannot be written to: the next command tries again
+        return result
+    with suppress(OSError):  # If the folder cannot be written, the next command tries again.
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_text_atomically(json.dumps(asdict(found) | {"driver": contact.driver}, indent=2), path)
-    return found
+        write_text_atomically(json.dumps(asdict(result) | {"driver": contact.driver}, indent=2), path)
+    return result
 
 
-def _kept(path: Path) -> Verdict | None:
+def _saved(path: Path) -> Verdict | None:
     try:
-        held: dict[str, Any] = json.loads(path.read_text("utf8"))
-        return Verdict(str(held["reason"]), str(held["gpus"]), float(held["seconds"]))
-    except (OSError, ValueError, KeyError, TypeError):  # none, or a damaged one: it is made again
+        content: dict[str, Any] = json.loads(path.read_text("utf8"))
+        return Verdict(str(content["reason"]), str(content["gpus"]), float(content["seconds"]))
+    except (OSError, ValueError, KeyError, TypeError):  # A missing or damaged file is written again.
         return None
 
 
 def try_in_child(backend: str, devices: Sequence[str], seconds: float = _SECONDS) -> str:
-    """Run ``trial`` in a process of its own; return why the backend must not serve, or ""."""
+    """Run ``trial`` in a process of its own; return why the backend must not be used, or ""."""
     command = [sys.executable, "-c", _CHILD, json.dumps(sys.path), backend, *devices]
     environment = {**os.environ, TRUST: "1"}
     try:
@@ -135,50 +132,49 @@ def try_in_child(backend: str, devices: Sequence[str], seconds: float = _SECONDS
             bound(command, signal.SIGKILL), capture_output=True, text=True, timeout=seconds, env=environment
         )
     except subprocess.TimeoutExpired:
-        return f"a small scene was not drawn within {seconds:g} seconds"
+        return f"a small scene was not rendered within {seconds:g} seconds"
     if done.returncode < 0:
         with suppress(ValueError):
-            return f"drawing a small scene ended with {signal.Signals(-done.returncode).name}"
+            return f"rendering a small scene ended with {signal.Signals(-done.returncode).name}"
     lines = done.stdout.strip().splitlines()
     if done.returncode != 0 or not lines:
-        said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-        raised = [line for line in said if _RAISED.match(line)]  # an exception's first line says what went wrong
-        return f"drawing a small scene failed ({(raised or said)[-1]})"
+        errors = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+        raised = [line for line in errors if _RAISED.match(line)]  # An exception's first line names the cause.
+        return f"rendering a small scene failed ({(raised or errors)[-1]})"
     try:
         return str(json.loads(lines[-1]))
     except ValueError:
-        return f"drawing a small scene ended without a result ({lines[-1]})"
+        return f"rendering a small scene ended without a result ({lines[-1]})"
 
 
 @cache
 def settle() -> str | None:
-    """Return one sentence if the CUDA backend must not serve unasked, and take it out of this process's use; else None.
+    """Refuse the CUDA backend in this process if "auto" must not choose it, and return one sentence why; else None.
 
-    None too where it cannot run at all, or is trusted (``TRUST``). The sentence is printed, once a process.
+    Returns None too where it cannot run at all, or is trusted (``TRUST``). The sentence is printed once per process.
     """
     if os.environ.get(TRUST) == "1":
         return None
     try:
         if (contact := this_machine()) is None:
             return None
-        found = verdict(contact, say=_say)
+        result = verdict(contact, say=_say)
     except RuntimeError as error:
-        found = Verdict(
-            f"torch cannot open it ({(str(error).splitlines() or [type(error).__name__])[0]})", "the GPU", 0.0
-        )
-    if not found.reason:
+        cause = (str(error).splitlines() or [type(error).__name__])[0]
+        result = Verdict(f"torch cannot open it ({cause})", "the GPU", 0.0)
+    if not result.reason:
         return None
-    sentence = refusal(found)
+    sentence = refusal(result)
     cuda_extension.refuse(sentence)
     _say(sentence)
     return sentence
 
 
-def refusal(found: Verdict) -> str:
-    """Return the sentence on a verdict that is against the GPU."""
+def refusal(against: Verdict) -> str:
+    """Return the sentence on a verdict against the GPU."""
     return (
-        f"the CPU serves in place of {found.gpus}: {found.reason}; beags doctor tries again, {TRUST}=1 takes the GPU "
-        "all the same."
+        f"the CPU is used instead of {against.gpus}: {against.reason}; beags doctor tries again, {TRUST}=1 uses the "
+        "GPU all the same."
     )
 
 

@@ -13,7 +13,7 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import IGNORE
 
 MIN_ALPHA = 1.0 / 255.0  # weaker contributions are skipped: they are invisible in 8 bits
-LARGEST = 1e18  # world units: larger or more distant Gaussians count as broken; their squares overflow float32
+LARGEST = 1e18  # world units; larger or more distant Gaussians count as broken: their squares overflow float32
 MAX_ALPHA = 0.99  # keeps 1 - alpha, a divisor in the backward, away from 0
 MIN_TRANSMITTANCE = 1e-4  # compositing stops before the Gaussian that would take T below this
 
@@ -27,7 +27,7 @@ class RasterSettings:
 
     near, far: world units; they scale with the scene. Hits nearer than ``near`` are skipped. The distortion's depth
         mapping uses both: m(d) = far / (far - near) * (1 - near / d).
-    geometry: whether to compute depth, median depth and normal; without, they are None and cost nothing.
+    geometry: whether to compute depth, median depth and normal; otherwise they are None and cost nothing.
     distortion: whether to compute the distortion.
     """
 
@@ -129,8 +129,8 @@ class RasterOutputs:
 class Rasterizer(ABC):
     """One backend: all its methods render Gaussians with the same weights w_i (E4).
 
-    A backend writes the five abstract methods. ``rasterizers.optional`` has what only refiners of other packages ask
-    for. An instance holds no scene and may be kept for the life of the program.
+    A backend implements the five abstract methods. ``rasterizers.optional`` has products that only refiners of other
+    packages need. An instance holds no scene and may live as long as the program.
     """
 
     @classmethod
@@ -172,8 +172,8 @@ class Rasterizer(ABC):
     ) -> tuple[Tensor, Tensor]:
         """Return the non-zero entries of ``class_contributions``: keys [M] int64 and values [M].
 
-        The keys are i * num_classes + c, ascending. This method makes a dense table of the classes that ``labels``
-        hold; a backend that can do without one should override it.
+        The keys are i * num_classes + c, ascending. This method makes a dense table of the classes in ``labels``; a
+        backend that needs no table should override it.
         """
         return sparse_table(
             lambda slots, count: self.class_contributions(inputs, camera, settings, slots, count), labels, num_classes
@@ -185,8 +185,8 @@ class Rasterizer(ABC):
     ) -> tuple[Tensor, Tensor]:
         """Return the class of every pixel, argmax_c sum_i w_i [phi_i = c], and its share (method, section 5).
 
-        Returns [H, W] int32, with ties to the lower id and 0 (background) where nothing is; and [H, W] float, the
-        winner's share of A, 0 where nothing is. Neither has a gradient.
+        Returns [H, W] int32, with ties to the lower id; and [H, W] float, the class's share of A. Both are 0 where
+        A = 0. Neither has a gradient.
         """
 
     def feature_channels(
@@ -194,8 +194,8 @@ class Rasterizer(ABC):
     ) -> Tensor | None:
         """Render features as ``rendering.draw_features`` does, but in one pass.
 
-        Returns None where rendering three channels at a time costs less. The caller has given every Gaussian with a
-        feature that is not finite such a colour too.
+        Returns None where rendering three channels at a time costs less. Every Gaussian with a feature that is not
+        finite must have a colour that is not finite too.
         """
         return None
 
@@ -213,6 +213,6 @@ def sparse_table(table: Callable[[Tensor, int], Tensor], labels: Tensor, num_cla
     present = torch.unique(labels[(labels >= 0) & (labels < num_classes)])
     columns = torch.searchsorted(present, labels)
     known = torch.isin(labels, present)
-    found = table(torch.where(known, columns, IGNORE).int(), len(present))
-    surfel, column = torch.nonzero(found, as_tuple=True)
-    return surfel * num_classes + present[column].long(), found[surfel, column]
+    dense = table(torch.where(known, columns, IGNORE).int(), len(present))
+    surfel, column = torch.nonzero(dense, as_tuple=True)
+    return surfel * num_classes + present[column].long(), dense[surfel, column]

@@ -1,4 +1,4 @@
-"""The compiled CPU rasterizer: checks and allocates here, computes in ``beags_plugin._native``."""
+"""The compiled CPU rasterizer: it checks and allocates here, and computes in ``beags_plugin._native``."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class WorkCounts:
     """Work of one forward, which unlike its time has no noise.
 
     lanes: pixel lanes that the kernels evaluate. contributing: (pixel, surfel) pairs among them that contribute.
-    tile_pairs: (tile, surfel) pairs that are kept. box_pairs: those in the usual bounds, boxes of 3.33 standard
-        deviations.
+    tile_pairs: (tile, surfel) pairs of the kernels' bounds. box_pairs: those of the usual bounds, boxes of 3.33
+        standard deviations.
     """
 
     lanes: int
@@ -42,21 +42,18 @@ class WorkCounts:
 
 
 def instruction_set() -> str:
-    """Return the instruction set in use, which BEAGS_ISA in the environment may force.
-
-    Raises ``UserError`` if that one cannot run.
-    """
+    """Return the instruction set in use, which BEAGS_ISA may force; raises ``UserError`` if that one cannot run."""
     return _module().instruction_set()
 
 
 def instruction_sets() -> list[str]:
-    """Return those that this build holds and this processor runs, best first; "scalar", a reference, comes last."""
+    """Return the instruction sets that this build and processor have, best first; "scalar", a reference, is last."""
     return _module().instruction_sets()
 
 
 @torch.no_grad()
 def work_counts(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> WorkCounts:
-    """Measure what a render takes; see ``Rasterizer.rasterize`` for the arguments."""
+    """Count the work of a render; the arguments are as of ``Rasterizer.rasterize``."""
     frame, _ = _frame(inputs.checked().detached(), camera, settings)
     return WorkCounts(*frame.work_counts(extension.threads()))
 
@@ -73,11 +70,9 @@ class NativeRasterizer(KernelRasterizer, OptionalProducts):
 
     @classmethod
     def unavailable(cls) -> str | None:
-        """See ``Rasterizer.unavailable``."""
         return extension.status()[1]
 
     def forward_kernel(self, call: RenderCall) -> Forward:
-        """See ``KernelRasterizer.forward_kernel``."""
         frame, visible = _frame(call.inputs, call.camera, call.settings)
         images = call.empty_images()
         frame.forward(call.background, call.target, *images, call.differentiable, extension.threads())
@@ -88,22 +83,21 @@ class NativeRasterizer(KernelRasterizer, OptionalProducts):
     ) -> InputGradients:
         """See ``KernelRasterizer.backward_kernel``.
 
-        Only what is needed is allocated and returned. Gradients of ``colors`` and ``background`` alone cost less; those
-        of ``opacity_logits`` still spare the backward of the projection.
+        Gradients of ``colors`` and ``background`` alone cost less; with ``opacity_logits`` they still skip the backward
+        of the projection.
         """
         floats = [getattr(call.inputs, name) for name in FLOATS]
         shift = call.inputs.means[:, :2]
         likes = zip((*floats, shift, call.background), needed, strict=True)
-        # not torch.zeros: the kernel writes the zeros of the surfels that are not seen
-        found = InputGradients(*[value.new_empty(value.shape) if wanted else None for value, wanted in likes])
-        state.backward(*floats, call.target, *gradients, *found, extension.threads())
-        return found
+        # new_empty suffices: the kernel writes zeros for the surfels that no pixel shows.
+        results = InputGradients(*[value.new_empty(value.shape) if wanted else None for value, wanted in likes])
+        state.backward(*floats, call.target, *gradients, *results, extension.threads())
+        return results
 
     @torch.no_grad()
     def class_contributions(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, labels: Tensor, num_classes: int
     ) -> Tensor:
-        """See ``Rasterizer.class_contributions``."""
         inputs = inputs.checked().detached()
         labels = check_image("labels", labels, camera)
         frame, _ = _frame(inputs, camera, settings)
@@ -111,17 +105,11 @@ class NativeRasterizer(KernelRasterizer, OptionalProducts):
         frame.class_contributions(labels, num_classes, out, extension.threads())
         return out
 
-    @torch.no_grad()
     def sparse_class_contributions(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, labels: Tensor, num_classes: int
     ) -> tuple[Tensor, Tensor]:
-        """See ``Rasterizer.sparse_class_contributions``."""
-        inputs = inputs.checked().detached()
-        labels = check_image("labels", labels, camera)
-        frame, _ = _frame(inputs, camera, settings)
-        return _listed(frame.sparse_class_contributions(labels, num_classes, extension.threads()), inputs.means)
+        return _sparse("sparse_class_contributions", inputs, camera, settings, labels, num_classes)
 
-    @torch.no_grad()
     def sparse_class_pixel_counts(
         self,
         inputs: SurfelInputs,
@@ -132,14 +120,10 @@ class NativeRasterizer(KernelRasterizer, OptionalProducts):
         min_weight: float = 0.0,
     ) -> tuple[Tensor, Tensor]:
         """See ``OptionalProducts.sparse_class_pixel_counts``; in float32, counts are exact up to 2^24."""
-        inputs = inputs.checked().detached()
-        labels = check_image("labels", labels, camera)
-        frame, _ = _frame(inputs, camera, settings)
-        found = frame.sparse_class_pixel_counts(labels, num_classes, min_weight, extension.threads())
-        keys, counts = _listed(found, inputs.means)
+        what = (inputs, camera, settings, labels, num_classes, min_weight)
+        keys, counts = _sparse("sparse_class_pixel_counts", *what)
         return keys, counts.int()
 
-    @torch.no_grad()
     def sparse_top_contributions(
         self,
         inputs: SurfelInputs,
@@ -150,18 +134,12 @@ class NativeRasterizer(KernelRasterizer, OptionalProducts):
         most: int,
         within: int,
     ) -> tuple[Tensor, Tensor]:
-        """See ``OptionalProducts.sparse_top_contributions``."""
-        inputs = inputs.checked().detached()
-        labels = check_image("labels", labels, camera)
-        frame, _ = _frame(inputs, camera, settings)
-        found = frame.sparse_top_contributions(labels, num_classes, most, within, extension.threads())
-        return _listed(found, inputs.means)
+        return _sparse("sparse_top_contributions", inputs, camera, settings, labels, num_classes, most, within)
 
     @torch.no_grad()
     def class_map(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
     ) -> tuple[Tensor, Tensor]:
-        """See ``Rasterizer.class_map``."""
         inputs = inputs.checked().detached()
         map_ids(inputs, num_classes)
         frame, _ = _frame(inputs, camera, settings)
@@ -173,7 +151,6 @@ class NativeRasterizer(KernelRasterizer, OptionalProducts):
     def class_channels(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
     ) -> Tensor:
-        """See ``OptionalProducts.class_channels``."""
         inputs = inputs.checked()
         map_ids(inputs, num_classes)
         return _channels(inputs, camera, settings, num_classes, None)
@@ -181,16 +158,14 @@ class NativeRasterizer(KernelRasterizer, OptionalProducts):
     def feature_channels(
         self, inputs: SurfelInputs, features: Tensor, camera: Camera, settings: RasterSettings
     ) -> Tensor | None:
-        """See ``Rasterizer.feature_channels``; up to 3 channels cost least as the colours of an image."""
         inputs, count = inputs.checked(), features.shape[1]
-        if count <= 3:
+        if count <= 3:  # They cost less as the colours of an image.
             return None
         padded = torch.nn.functional.pad(features, (0, -count % 4)).contiguous()
         return _channels(inputs, camera, settings, 0, padded)[..., :count]
 
     @torch.no_grad()
     def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
-        """See ``Rasterizer.dominant_gaussian``."""
         frame, _ = _frame(inputs.checked().detached(), camera, settings)
         indices = torch.empty(camera.height, camera.width, dtype=torch.int32)
         frame.dominant_gaussian(indices, extension.threads())
@@ -201,14 +176,12 @@ def _channels(
     inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int, features: Tensor | None
 ) -> Tensor:
     floats = [getattr(inputs, name) for name in FLOATS]
-    found: Any = _Channels.apply(
-        inputs.detached(), camera, settings, num_classes, features, *floats, inputs.screen_shift
-    )
-    return found
+    what = (inputs.detached(), camera, settings, num_classes, features)
+    return _Channels.apply(*what, *floats, inputs.screen_shift)  # type: ignore[return-value]
 
 
 class _Channels(torch.autograd.Function):
-    """Channels of classes or, if there are any, of features."""
+    """Channels of features or, if these are None, of classes."""
 
     @staticmethod
     def forward(ctx, inputs, camera, settings, num_classes, features, *floats):
@@ -232,19 +205,26 @@ class _Channels(torch.autograd.Function):
         wants_features, *geometry, _, shift = ctx.needs_input_grad[4:]
         values = (means, quats, log_scales, opacity_logits, means[:, :2], features)
         likes = zip(values, (*geometry, shift, wants_features), strict=True)
-        *found, g_features = [value.new_empty(value.shape) if wanted else None for value, wanted in likes]
+        *results, to_features = [value.new_empty(value.shape) if wanted else None for value, wanted in likes]
         if features is None:
-            ctx.frame.class_channels_backward(*floats, gradient.contiguous(), *found, extension.threads())
+            ctx.frame.class_channels_backward(*floats, gradient.contiguous(), *results, extension.threads())
         else:
-            those = (features, gradient.contiguous(), *found, g_features)
-            ctx.frame.feature_channels_backward(*floats, *those, extension.threads())
-        return None, None, None, None, g_features, *found[:4], None, found[4]
+            of_features = (features, gradient.contiguous(), *results, to_features)
+            ctx.frame.feature_channels_backward(*floats, *of_features, extension.threads())
+        return None, None, None, None, to_features, *results[:4], None, results[4]
 
 
-def _listed(found: Any, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the keys and values of the compiled module's ``Contributions``."""
-    keys, values = torch.empty(found.count, dtype=torch.int64), like.new_empty(found.count)
-    found.write(keys, values)
+@torch.no_grad()
+def _sparse(
+    name: str, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, labels: Tensor, *numbers: float
+) -> tuple[Tensor, Tensor]:
+    """Return the keys and values that the method ``name`` of the compiled frame lists for ``labels``."""
+    inputs = inputs.checked().detached()
+    labels = check_image("labels", labels, camera)
+    frame, _ = _frame(inputs, camera, settings)
+    listed = getattr(frame, name)(labels, *numbers, extension.threads())
+    keys, values = torch.empty(listed.count, dtype=torch.int64), inputs.means.new_empty(listed.count)
+    listed.write(keys, values)
     return keys, values
 
 

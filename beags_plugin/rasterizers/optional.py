@@ -1,4 +1,4 @@
-"""What a backend may compute besides: products that some refiners of other packages ask for, and no part of beags."""
+"""Products that a backend may compute besides, for some refiners of other packages; beags itself needs none."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from beags_plugin.system.errors import UserError
 
 
 class OptionalProducts(ABC):
-    """A second base class of those backends that have these products; all use the weights w_i of ``rasterize``."""
+    """The second base class of backends with these products; all use the weights w_i of ``rasterize``."""
 
     @abstractmethod
     def sparse_class_pixel_counts(
@@ -24,10 +24,10 @@ class OptionalProducts(ABC):
         num_classes: int,
         min_weight: float = 0.0,
     ) -> tuple[Tensor, Tensor]:
-        """Return the numbers of pixels u with labels(u) = c and w_i(u) > min_weight that are not zero.
+        """Return the non-zero numbers of pixels u with labels(u) = c and w_i(u) > min_weight.
 
-        They are keys [M] int64 as in ``Rasterizer.sparse_class_contributions``, and counts [M] int32. A hidden surfel
-        counts too until compositing stops before it. No gradient.
+        Returns keys [M] int64 as in ``Rasterizer.sparse_class_contributions``, and counts [M] int32, without gradient.
+        A hidden surfel counts too unless compositing stops before it.
         """
 
     @abstractmethod
@@ -41,25 +41,25 @@ class OptionalProducts(ABC):
         most: int,
         within: int,
     ) -> tuple[Tensor, Tensor]:
-        """Return ``Rasterizer.sparse_class_contributions`` where of each pixel only the ``most`` largest w_i count.
+        """Return ``Rasterizer.sparse_class_contributions`` of the ``most`` largest w_i of each pixel, without gradient.
 
-        They are chosen, of equal ones the nearer, among the first ``within`` (at least 1, as ``most``) that the pixel
-        has. No gradient.
+        They are chosen among the first ``within`` hits of the pixel, the nearer of equals first. Both numbers are at
+        least 1.
         """
 
     @abstractmethod
     def class_channels(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
     ) -> Tensor:
-        """Return [H, W, num_classes], p_c = sum_i w_i [phi_i = c], differentiable in the inputs but their colours.
+        """Return [H, W, num_classes], p_c = sum_i w_i [phi_i = c], differentiable in the inputs except the colours.
 
-        A backend should take the same time for any number of classes if it can, as dL/dw_i is dL/dp at phi_i; else
-        ``rendering.class_channels_by_threes`` does it.
+        The time need not grow with the number of classes, because dL/dw_i is dL/dp at phi_i. A backend without such a
+        kernel calls ``rendering.class_channels_by_threes``.
         """
 
 
 def optional_products(rasterizer: Rasterizer) -> OptionalProducts:
-    """Return a backend as one that has the optional products; raises ``UserError`` if it has none."""
+    """Return the backend if it has the optional products; raises ``UserError`` if it has none."""
     if isinstance(rasterizer, OptionalProducts):
         return rasterizer
     raise UserError(

@@ -1,30 +1,21 @@
-"""Numbers of pairs, of a tile and a surfel that reaches it, in renders on GPUs.
+"""Numbers of pairs (a tile and a surfel that reaches it) in renders on GPUs.
 
-Only the GPU knows them. The host guesses from earlier renders, so that there is memory before the number arrives.
+The GPU counts them. The host guesses the number from earlier renders, to allocate memory before it arrives.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from threading import get_ident
-from typing import Any
 
 import torch
 from torch import Tensor
 
-_FADING = 0.98  # of the largest number of pairs so far, in each render
-_SPARE = 1.25  # memory for this many times the pairs of the largest render so far
-_STEP = 1 << 14  # pairs, or an eighth of the power of two below: few different sizes leave torch's allocator no holes
+_FADING = 0.98  # factor per render on the largest number of pairs so far
+_SPARE = 1.25  # factor from the expected pairs to the allocated ones
+_STEP = 1 << 14  # pairs, or an eighth of the power of two below: few distinct sizes do not fragment torch's allocator
 
-Place = tuple[torch.device, int]  # a GPU and a thread: a viewer's renders change nothing of a training
-
-
-@dataclass
-class Sent:
-    """A render's numbers on their way to the host: of pairs, and of surfels that are not finite."""
-
-    numbers: Tensor
-    event: Any
+Place = tuple[torch.device, int]  # a GPU and a thread, so that a viewer's renders do not affect a training
 
 
 class PairCounts:
@@ -43,29 +34,28 @@ class PairCounts:
         return device, get_ident()
 
     def guess(self, place: Place) -> float | None:
-        """Return the number to expect; None before the first render there."""
+        """Return the number to expect; None before the first render at this place."""
         return self._largest.get(place)
 
     def learn(self, place: Place, pairs: int) -> None:
         """Note the number of pairs that a render had."""
         self._largest[place] = max(self._largest.get(place, 0.0) * _FADING, float(pairs))
 
-    def send(self, totals: Tensor) -> Sent:
-        """Start to copy the two numbers of a render to the host."""
-        if not totals.is_cuda:
-            return Sent(totals, None)
-        numbers = torch.empty(2, dtype=torch.int64, pin_memory=True)  # torch keeps such memory for the next ones
-        numbers.copy_(totals, non_blocking=True)
-        event = torch.cuda.Event()
-        event.record()
-        return Sent(numbers, event)
 
-    def receive(self, sent: Sent) -> tuple[int, int]:
-        """Wait for the numbers: of pairs, and of surfels that are not finite."""
-        if sent.event is not None:
-            sent.event.synchronize()
-        pairs, nonfinite = sent.numbers.tolist()
-        return pairs, nonfinite
+def start_copy(totals: Tensor) -> Callable[[], list[int]]:
+    """Start to copy ``totals`` [2] to the host; return a function that waits for the two numbers."""
+    if not totals.is_cuda:
+        return totals.tolist
+    numbers = torch.empty(2, dtype=torch.int64, pin_memory=True)  # torch reuses pinned memory.
+    numbers.copy_(totals, non_blocking=True)
+    event = torch.cuda.Event()
+    event.record()
+
+    def wait() -> list[int]:
+        event.synchronize()
+        return numbers.tolist()
+
+    return wait
 
 
 def capacity_for(pairs: float) -> int:

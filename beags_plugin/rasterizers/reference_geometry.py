@@ -17,13 +17,13 @@ from beags_plugin.rasterizers.interface import LARGEST, MAX_ALPHA, MIN_ALPHA, Ra
 class ProjectedSurfels:
     """K surfels that survived culling, nearest first.
 
-    index: [K] int64, their places among the inputs.
+    index: [K] int64, their indices among the inputs.
     A, B, C: [K, 3] the ray-splat cross product is q = dx A + dy B + C, with (dx, dy) the pixel minus ``shifted``.
     det: [K] determinant of M; the plane's depth along a ray is det / q_z.
-    center: [K, 2] pixels, the projected mean c, around which the low-pass filter lies; shifted: [K, 2] the same, moved
-        by the inputs' ``screen_shift``, with the disc. depth: [K] its depth p_z.
+    center: [K, 2] pixels, the projected mean c, the centre of the low-pass filter; shifted: [K, 2] the same moved by
+        the inputs' ``screen_shift``, the centre of the disc. depth: [K] the depth p_z of the mean.
     normal: [K, 3] camera space, towards the camera. opacity: [K]. box: [K, 4] x0, y0, x1, y1 in pixels.
-    num_nonfinite: how many of the inputs were dropped because they, or what they project to, are not finite.
+    num_nonfinite: number of inputs that were dropped because they, or their projection, are not finite.
     """
 
     index: Tensor
@@ -62,17 +62,18 @@ def project(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> P
         finite = finite_surfels(inputs) & (depth <= LARGEST)
         opacity = torch.sigmoid(inputs.opacity_logits)
         index = (finite & (depth > settings.near) & (opacity >= MIN_ALPHA)).nonzero()[:, 0]
-        index = index[depth[index].argsort(stable=True)]  # by centre depth, ties by index
+        index = index[depth[index].argsort(stable=True)]  # Order: centre depth, then index.
     projected = _project(inputs, index, camera)
     sound = _is_finite(projected)
     if not bool(sound.all()):
-        # Projected anew without those that overflow: in the backward even a discarded infinity would turn into NaN.
+        # Surfels that overflow are left out and the rest projected again: even an unused infinity would give NaN in the
+        # backward.
         projected = _project(inputs, index[sound], camera)
     return replace(projected, num_nonfinite=int((~finite).sum()) + int((~sound).sum()))
 
 
 def _is_finite(projected: ProjectedSurfels) -> Tensor:
-    """Return [K] bool: nothing overflowed on the way to the screen; the box may be infinite."""
+    """Return [K] bool: the projection did not overflow; the box may be infinite."""
     fields = (projected.A, projected.B, projected.C, projected.center, projected.det[:, None], projected.depth[:, None])
     return torch.isfinite(torch.cat(fields, dim=-1)).all(dim=-1)
 
@@ -92,7 +93,7 @@ def _project(inputs: SurfelInputs, index: Tensor, camera: Camera) -> ProjectedSu
         moved = torch.cat([M[:, :2, 2] + inputs.screen_shift[index] * half * M[:, 2:, 2], M[:, 2:, 2]], dim=-1)
         M = torch.cat([M[:, :, :2], moved[:, :, None]], dim=-1)
     shifted = M[:, :2, 2] / M[:, 2:, 2]
-    # With the pixel counted from the disc's centre, large coordinates no longer cancel:
+    # With the pixel relative to the disc's centre, large coordinates no longer cancel:
     # (dx Mw - Mx') x (dy Mw - My') is affine in dx, dy, because Mw x Mw = 0. (E2)
     Mw = M[:, 2]
     Mx, My = M[:, 0] - shifted[:, :1] * Mw, M[:, 1] - shifted[:, 1:] * Mw
@@ -125,7 +126,7 @@ def _screen_box(M: Tensor, center: Tensor, opacity: Tensor, camera: Camera) -> T
     high = torch.maximum(conic_center + half, center + low_pass)
     box = torch.cat([low, high], dim=-1)
     screen = box.new_tensor([0.0, 0.0, camera.width, camera.height])
-    # a disc that crosses the camera plane has no conic: it may be anywhere on the screen
+    # A disc that crosses the camera plane has no conic: it may lie anywhere on the screen.
     return torch.where((d < 0)[:, None] & torch.isfinite(box).all(dim=-1, keepdim=True), box, screen)
 
 
@@ -144,8 +145,8 @@ def hits(projected: ProjectedSurfels, chosen: Tensor, pixels: Tensor, near: floa
     q = dx * projected.A[chosen] + dy * projected.B[chosen] + projected.C[chosen]  # (E2)
     rho2d = 2.0 * (pixels[:, None] - projected.center[chosen]).square().sum(dim=-1)
     with torch.no_grad():
-        # Decided first: where the low-pass wins q_z may be 0 (the ray runs along the plane) or so small that rho3d
-        # overflows, and then the branch not taken would still send NaN back.
+        # The choice comes first: where the low-pass wins, q_z may be 0 (the ray runs along the plane) or so small that
+        # rho3d overflows, and then the branch not taken would still send NaN to the backward.
         on_disc = (q[..., 2] != 0) & ((q[..., :2] / q[..., 2:]).square().sum(dim=-1) <= rho2d)
     q_z = torch.where(on_disc, q[..., 2], torch.ones_like(q[..., 2]))
     rho3d = (q[..., 0] / q_z) ** 2 + (q[..., 1] / q_z) ** 2

@@ -15,7 +15,7 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, Raster
 from beags_plugin.system.errors import check_choice
 
 SURFACE_DEPTHS = ("median", "expected")
-"""Which of E4's depths stands for the surface where pixels are lifted into space."""
+"""The depths of E4 that can stand for the surface where pixels are lifted into space."""
 
 
 def surfel_inputs(
@@ -31,14 +31,14 @@ def surfel_inputs(
 
 
 def geometry_inputs(surfels: Surfels, class_ids: Tensor | None = None) -> SurfelInputs:
-    """Return the scene without colours and gradients: for depth and the products that have no gradient."""
+    """Return the scene without colours and gradients, for depth and products without gradient."""
     bare = surfels.detach()
     colors = torch.zeros_like(bare.means)
     return SurfelInputs(bare.means, bare.quats, bare.log_scales, bare.opacity_logits, colors, class_ids)
 
 
 def shape_inputs(surfels: Surfels, members: Tensor) -> SurfelInputs:
-    """Return some Gaussians without colours: for their alpha and depth, differentiable.
+    """Return some Gaussians without colours, for their alpha and depth; differentiable.
 
     surfels: N surfels. members: [M] int64, each at most once, so that every device adds the gradients alike.
     """
@@ -50,9 +50,7 @@ def shape_inputs(surfels: Surfels, members: Tensor) -> SurfelInputs:
 def render_class_map(
     rasterizer: Rasterizer, surfels: Surfels, class_ids: Tensor, camera: Camera, settings: RasterSettings
 ) -> tuple[Tensor, Tensor]:
-    """Render the ``Rasterizer.class_map`` of class ids that may lie far apart.
-
-    The rasterizer gets their ranks.
+    """Render the ``Rasterizer.class_map`` of class ids that may lie far apart: the rasterizer gets their ranks.
 
     surfels: N surfels. class_ids: [N] int32, phi. Returns ([H, W] int32 class ids, [H, W] float share), no gradient.
     """
@@ -67,9 +65,9 @@ def draw_features(
 ) -> Tensor:
     """Render any number of channels, [H, W, F] sum_i w_i f_i: no background, not divided by A.
 
-    features: [N, F] of the inputs' dtype, F at least 1. Differentiable in them and in the inputs but the colours.
-    A surfel with a number that is not finite, be it a colour or a feature, has no part in any channel. Three channels
-    are rendered at a time, which every backend can, unless it has a ``feature_channels``.
+    features: [N, F] of the inputs' dtype, F at least 1. Differentiable in them and in the inputs except the colours.
+    A surfel with a colour or feature that is not finite contributes to no channel. Backends without
+    ``feature_channels`` render three channels at a time.
     """
     channels, n = features.shape[-1], len(inputs.means)
     if features.shape != (n, channels) or features.dtype != inputs.means.dtype:
@@ -77,8 +75,8 @@ def draw_features(
         raise ValueError(f"features must be {expected}, not {got}")
     broken = sum((0 * value.detach()).sum(dim=1, keepdim=True) for value in (features, inputs.colors))  # NaN, else 0
     inputs = replace(inputs, colors=inputs.colors.detach() + broken)
-    if (drawn := rasterizer.feature_channels(inputs, features, camera, settings)) is not None:
-        return drawn
+    if (image := rasterizer.feature_channels(inputs, features, camera, settings)) is not None:
+        return image
     settings = replace(settings, geometry=False, distortion=False)
     padded = torch.nn.functional.pad(features + broken, (0, -channels % 3))
     nothing = features.new_zeros(3)
@@ -92,25 +90,20 @@ def draw_features(
 def class_channels_by_threes(
     rasterizer: Rasterizer, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
 ) -> Tensor:
-    """Do what ``OptionalProducts.class_channels`` says by ``draw_features``, for backends that have nothing faster."""
+    """Compute ``OptionalProducts.class_channels`` by ``draw_features``, for backends without a faster way."""
     one_hot = torch.nn.functional.one_hot(map_ids(inputs, num_classes).long(), num_classes)
     return draw_features(rasterizer, inputs, one_hot.to(inputs.means), camera, settings)
 
 
-def check_surface_depth(kind: str) -> None:
-    """Raise ``UserError`` unless ``kind`` is one of ``SURFACE_DEPTHS``."""
-    check_choice(kind, SURFACE_DEPTHS, "surface depth")
-
-
 def surface_depth(render: RasterOutputs, kind: str) -> Tensor:
-    """Return [H, W] depth of the surface that each pixel shows, world units; 0 where nothing (solid) is.
+    """Return [H, W] depth of the surface that each pixel shows, world units; 0 where there is none.
 
-    kind: "median", the hit at which half of the light is stopped: always on a surface; or "expected", the mean over
-    all hits (the D of E5): at an object's boundary it lies in the air between the object and what is behind.
+    kind: "median", the hit at which half of the light is stopped, which always lies on a surface; or "expected", the
+    mean over all hits (the D of E5), which at an object's boundary lies between the object and its background.
     Raises ``UserError`` for another kind.
     """
-    check_surface_depth(kind)
+    check_choice(kind, SURFACE_DEPTHS, "surface depth")
     surface = render.median_depth if kind == "median" else render.depth
     if surface is None:
-        raise ValueError("the settings must ask for geometry")
+        raise ValueError("the settings must request geometry")
     return surface

@@ -25,15 +25,15 @@ from beags_plugin.rasterizers.optional import OptionalProducts
 from beags_plugin.rasterizers.reference_geometry import ProjectedSurfels, hits, on_screen, project
 from beags_plugin.rasterizers.rendering import class_channels_by_threes
 
-KEPT_PER_PAIR = 40  # numbers that autograd keeps per pixel and surfel, as measured
+KEPT_PER_PAIR = 40  # numbers that autograd keeps per pixel and surfel; measured
 BLOCK = 16  # pixels are rendered in squares of this side, each with the surfels that reach it
 
 
 @dataclass(frozen=True)
 class _Block:
-    """P pixels of a square, S surfels that reach it, nearest first.
+    """P pixels of a square, and S surfels that reach it, nearest first.
 
-    rows, columns: slices of the image. index: [S] int64 places among the inputs; chosen: [S] among the projected.
+    rows, columns: slices of the image. index: [S] int64 indices of the inputs; chosen: [S] of the projected surfels.
     weights: [P, S] w_i. depth: [P, S]. remaining: [P] T_end. before, after: [P, S] transmittance around each surfel.
     """
 
@@ -125,7 +125,7 @@ class TorchRasterizer(Rasterizer, OptionalProducts):
     ) -> tuple[Tensor, Tensor]:
         def largest(weights: Tensor) -> Tensor:
             first = torch.where((weights > 0).cumsum(dim=-1) <= within, weights, torch.zeros_like(weights))
-            rank = first.sort(dim=-1, descending=True, stable=True).indices.argsort(dim=-1)  # of equals, the nearer
+            rank = first.sort(dim=-1, descending=True, stable=True).indices.argsort(dim=-1)  # The nearer wins ties.
             return torch.where(rank < most, first, torch.zeros_like(first))
 
         def table(slots: Tensor, count: int) -> Tensor:
@@ -144,10 +144,8 @@ class TorchRasterizer(Rasterizer, OptionalProducts):
         counted: Callable[[Tensor], Tensor],
     ) -> Tensor:
         """Sum ``counted`` of the weights [P, S] by surfel and label, [N, num_classes]."""
-        inputs, camera = inputs.checked(), camera.to(inputs.means)
-        projected = project(inputs, camera, settings)
         total = inputs.means.new_zeros(inputs.means.shape[0], num_classes)
-        for block in self._blocks(projected, camera, settings):
+        for block in self._blocks(inputs, camera, settings):
             here = labels[block.rows, block.columns].reshape(-1).long()
             one_hot = (here[:, None] == torch.arange(num_classes, device=here.device)).to(block.weights)
             total[block.index] += counted(block.weights).T @ one_hot  # (E6); IGNORE matches no class
@@ -157,16 +155,14 @@ class TorchRasterizer(Rasterizer, OptionalProducts):
     def class_map(
         self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings, num_classes: int
     ) -> tuple[Tensor, Tensor]:
-        inputs, camera = inputs.checked(), camera.to(inputs.means)
         class_ids = map_ids(inputs, num_classes)
-        projected = project(inputs, camera, settings)
-        rows = _Rows(camera.height, camera.width)
-        for block in self._blocks(projected, camera, settings):
+        rows = _Rows()
+        for block in self._blocks(inputs, camera, settings):
             ids = class_ids[block.index]
-            here = ClassRanks(ids)  # of the classes in this block alone: there may be 65,535 in all
+            here = ClassRanks(ids)  # Only the block's classes get a column: there may be 65,535 in all.
             one_hot = (here.ranks(ids)[:, None] == torch.arange(len(here), device=ids.device)).to(block.weights)
             per_class = block.weights @ one_hot
-            best = per_class.argmax(dim=-1)  # the first of equals, so ties go to the lower id
+            best = per_class.argmax(dim=-1)  # The first of equals wins, so ties go to the lower id.
             alpha = block.weights.sum(dim=-1)
             share = per_class.gather(1, best[:, None])[:, 0] / torch.where(alpha > 0, alpha, torch.ones_like(alpha))
             rows.put(block.rows, block.columns, {"class": here.class_ids(best)[:, None], "share": share[:, None]})
@@ -180,10 +176,8 @@ class TorchRasterizer(Rasterizer, OptionalProducts):
 
     @torch.no_grad()
     def dominant_gaussian(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Tensor:
-        inputs, camera = inputs.checked(), camera.to(inputs.means)
-        projected = project(inputs, camera, settings)
         image = torch.full((camera.height, camera.width), -1, dtype=torch.int32, device=inputs.means.device)
-        for block in self._blocks(projected, camera, settings):
+        for block in self._blocks(inputs, camera, settings):
             if block.index.shape[0] == 0:
                 continue
             weight, place = block.weights.max(dim=-1)
@@ -206,9 +200,9 @@ class TorchRasterizer(Rasterizer, OptionalProducts):
             block = self._block(projected, rows, columns, settings)
             return _composite(block, inputs, projected, settings, background, target)
 
-        # What autograd keeps grows with the scene: beyond the limit the backward renders each block again.
-        again = torch.is_grad_enabled() and _kept_bytes(projected, camera) > self.memory_limit
-        images = _Rows(camera.height, camera.width)
+        # The memory of autograd grows with the scene: beyond the limit the backward renders each block again.
+        again = torch.is_grad_enabled() and _autograd_bytes(projected, camera) > self.memory_limit
+        images = _Rows()
         for rows, columns in _squares(camera):
             if again:
                 images_here = checkpoint(render_block, rows, columns, use_reentrant=False, preserve_rng_state=False)
@@ -217,7 +211,9 @@ class TorchRasterizer(Rasterizer, OptionalProducts):
             images.put(rows, columns, images_here)
         return images.join()
 
-    def _blocks(self, projected: ProjectedSurfels, camera: Camera, settings: RasterSettings) -> Iterator[_Block]:
+    def _blocks(self, inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> Iterator[_Block]:
+        inputs, camera = inputs.checked(), camera.to(inputs.means)
+        projected = project(inputs, camera, settings)
         for rows, columns in _squares(camera):
             yield self._block(projected, rows, columns, settings)
 
@@ -230,7 +226,7 @@ class TorchRasterizer(Rasterizer, OptionalProducts):
         hit = hits(projected, chosen, pixels, settings.near, self.smooth_cutoff)
         after = torch.cumprod(1.0 - hit.alpha, dim=-1)
         before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=-1)[:, : after.shape[1]]
-        # `after` never grows, so all surfels from the one that would take it below the bound on are left out
+        # ``after`` never grows: the surfel that would take it below the bound and all behind it do not count.
         counted = after.detach() >= MIN_TRANSMITTANCE
         weights = torch.where(counted, hit.alpha * before, torch.zeros_like(before))
         remaining = torch.where(counted, 1.0 - hit.alpha, torch.ones_like(before)).prod(dim=-1)
@@ -245,8 +241,8 @@ def _squares(camera: Camera) -> Iterator[tuple[slice, slice]]:
             yield slice(y, min(y + BLOCK, camera.height)), slice(x, min(x + BLOCK, camera.width))
 
 
-def _kept_bytes(projected: ProjectedSurfels, camera: Camera) -> float:
-    """Estimate what autograd keeps of a render: numbers per pixel and surfel in the blocks that a box meets."""
+def _autograd_bytes(projected: ProjectedSurfels, camera: Camera) -> float:
+    """Estimate the memory that autograd keeps of a render, from the blocks that each surfel's box meets."""
     low, high = projected.box.clamp_min(0.0).unflatten(1, (2, 2)).unbind(1)
     high = torch.minimum(high, high.new_tensor([camera.width, camera.height]))
     sides = ((high / BLOCK).ceil() - (low / BLOCK).floor()).clamp_min(0.0) * BLOCK
@@ -278,8 +274,9 @@ def _composite(
         images["median"] = torch.where(passes, block.depth, torch.zeros_like(w)).sum(dim=-1, keepdim=True)
     if settings.distortion:
         m = settings.far / (settings.far - settings.near) * (1.0 - settings.near / block.depth)
-        # sum_{j<i} w_i w_j (m_i - m_j)^2 by sums over all nearer surfels
-        w0, w1, w2 = (_sum_before(w * m**power) for power in range(3))
+        # sum_{j<i} w_i w_j (m_i - m_j)^2 follows from sums over all nearer surfels.
+        terms = [w * m**power for power in range(3)]
+        w0, w1, w2 = (torch.cumsum(term, dim=-1) - term for term in terms)
         images["distortion"] = (w * (m * m * w0 - 2.0 * m * w1 + w2)).sum(dim=-1, keepdim=True)
     if target is not None:
         assert inputs.class_ids is not None
@@ -289,16 +286,10 @@ def _composite(
     return images
 
 
-def _sum_before(values: Tensor) -> Tensor:
-    """Return [P, S] sums over the entries before each along the last axis."""
-    return torch.cumsum(values, dim=-1) - values
-
-
 class _Rows:
-    """Puts square blocks together again, without writing into tensors that autograd watches."""
+    """Joins square blocks into images, without writing into tensors that autograd watches."""
 
-    def __init__(self, height: int, width: int) -> None:
-        self.height, self.width = height, width
+    def __init__(self) -> None:
         self._rows: dict[str, list[list[Tensor]]] = {}
 
     def put(self, rows: slice, columns: slice, images: dict[str, Tensor]) -> None:

@@ -1,8 +1,8 @@
-"""A small scene drawn forward and backward by a backend and by the torch reference, and whether both agree.
+"""Render a small scene forward and backward by a backend and by the torch reference, and compare the results.
 
 ``python -m beags_plugin.rasterizers.trial MODULE:CLASS DEVICE [DEVICE ...]`` prints as its last line, in JSON, a
-sentence on the first difference, or "" where there is none. ``first_contact`` runs it in a process of its own, which
-may crash or hang.
+sentence on the first difference, or "" if there is none. ``first_contact`` runs it in a process of its own, which may
+crash or hang.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from beags_plugin.rasterizers.interface import FLOATS, Rasterizer, RasterSetting
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 from beags_plugin.system.registry import load
 
-COUNT, WIDTH, HEIGHT, CLASSES = 300, 53, 39, 3  # several tiles, none of them whole at the right and the bottom
+COUNT, WIDTH, HEIGHT, CLASSES = 300, 53, 39, 3  # several tiles; those at the right and the bottom are cut
 _IMAGES = ("color", "alpha", "depth", "median_depth", "normal", "distortion", "boundary")
-_EXACT = 1e-6  # float64, relative to the largest value: a GPU's exp and sums differ from the CPU's in the last digits
-_ROUNDED = 1e-3  # float32, likewise, for images
-_ROUNDED_GRADIENT = 1e-2  # float32, of a gradient's length
-_CARRIED = 0.01  # share of float32's pixels that rounding may carry over a threshold (1/255, the median, a tie)
+_EXACT = 1e-6  # float64, relative to the largest value: exp and sums of a GPU differ from the CPU's in the last digits
+_ROUNDED = 1e-3  # float32 images, relative to the largest value
+_ROUNDED_GRADIENT = 1e-2  # float32 gradients, relative to the gradient's length
+_CARRIED = 0.01  # share of float32 pixels that rounding may move across a threshold (1/255, the median, a tie)
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What is drawn: the arguments of ``Rasterizer.rasterize``, on the CPU, and weights [H, W, 3] of the loss."""
+    """The arguments of ``Rasterizer.rasterize``, on the CPU, and weights [H, W, 3] of the loss."""
 
     inputs: SurfelInputs
     camera: Camera
@@ -66,19 +66,15 @@ def trial_scene(dtype: torch.dtype) -> Trial:
     return Trial(inputs.to(dtype), camera.to(dtype), settings, background.to(dtype), target, weights.to(dtype))
 
 
-def drawn(rasterizer: Rasterizer, trial: Trial, device: str) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Return all images and the gradients of a loss of all of them in the inputs, by name, on the CPU."""
-
-    def there(value: Tensor) -> Tensor:
-        return value.to(device)
-
-    leaves = {name: there(getattr(trial.inputs, name)).requires_grad_() for name in FLOATS}
-    ids = trial.inputs.class_ids
-    inputs = replace(trial.inputs, **leaves, class_ids=None if ids is None else there(ids))
-    camera = trial.camera.to(device)
-    made = rasterizer.rasterize(inputs, camera, trial.settings, there(trial.background), there(trial.target))
-    images = {name: getattr(made, name) for name in _IMAGES}
-    weights, loss = there(trial.weights), made.color.new_zeros(())
+def rendered(rasterizer: Rasterizer, trial: Trial, device: str) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Return all images, and the gradients of a loss over them with respect to the inputs, by name, on the CPU."""
+    leaves = {name: getattr(trial.inputs, name).to(device).requires_grad_() for name in FLOATS}
+    assert trial.inputs.class_ids is not None
+    inputs = replace(trial.inputs, **leaves, class_ids=trial.inputs.class_ids.to(device))
+    background, target = trial.background.to(device), trial.target.to(device)
+    render = rasterizer.rasterize(inputs, trial.camera.to(device), trial.settings, background, target)
+    images = {name: getattr(render, name) for name in _IMAGES}
+    weights, loss = trial.weights.to(device), render.color.new_zeros(())
     for image in images.values():
         loss = loss + (image * (weights if image.dim() == 3 else weights[..., 0])).sum()
     gradients = torch.autograd.grad(loss, list(leaves.values()))
@@ -89,24 +85,24 @@ def drawn(rasterizer: Rasterizer, trial: Trial, device: str) -> tuple[dict[str, 
 
 
 def difference(rasterizer: Rasterizer, device: str) -> str:
-    """Return what of a backend's results differs from the torch reference's on the CPU; "" if nothing does.
+    """Return which result of a backend differs from the torch reference's on the CPU; "" if none does.
 
     float64 must agree in every value, float32 within its bands; both are compared with the reference in float64.
     """
-    expected = drawn(TorchRasterizer(), trial_scene(torch.float64), "cpu")
-    for dtype, name_of in ((torch.float64, "float64"), (torch.float32, "float32")):
-        found = drawn(rasterizer, trial_scene(dtype), device)
-        for what, there, here in zip(("image", "gradient"), found, expected, strict=True):
-            for name, value in here.items():
-                if not _alike(there[name].double(), value, dtype, what):
-                    return f"the {what} {name} differs from the torch reference's in {name_of}"
+    expected = rendered(TorchRasterizer(), trial_scene(torch.float64), "cpu")
+    for dtype, dtype_name in ((torch.float64, "float64"), (torch.float32, "float32")):
+        results = rendered(rasterizer, trial_scene(dtype), device)
+        for what, values, references in zip(("image", "gradient"), results, expected, strict=True):
+            for name, reference in references.items():
+                if not _alike(values[name].double(), reference, dtype, what):
+                    return f"the {what} {name} differs from the torch reference's in {dtype_name}"
     return ""
 
 
-def _alike(found: Tensor, expected: Tensor, dtype: torch.dtype, what: str) -> bool:
-    if found.shape != expected.shape or not bool(found.isfinite().all()):
+def _alike(values: Tensor, expected: Tensor, dtype: torch.dtype, what: str) -> bool:
+    if values.shape != expected.shape or not bool(values.isfinite().all()):
         return False
-    errors, largest = (found - expected).abs(), float(expected.abs().max())
+    errors, largest = (values - expected).abs(), float(expected.abs().max())
     if dtype == torch.float64:
         return float(errors.max()) <= _EXACT * largest
     if what == "gradient":

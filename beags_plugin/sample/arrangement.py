@@ -21,19 +21,19 @@ from beags_plugin.sample.textures import (
 from beags_plugin.sample.tracing import hit_fixtures
 
 DOME_RADIUS = 5.0
-"""World units; the ground is the disc z = 0 of this radius, closed by the half-dome above it."""
+"""Radius of the ground, the disc z = 0, and of the half-dome above it, world units."""
 
 GROUND, DOME = 0, -1
 HUE_RANGE = 0.12
-"""Share of the colour circle that the objects' hues cover; the ground's lies among them."""
+"""Share of the colour circle that the hues of the objects cover; the ground's hue lies among them."""
 
 
 @dataclass(frozen=True)
 class Still(Scene):
     """The whole scene, on the ground under a dome.
 
-    sun: [3] unit vector towards the light. noise: of the ground and the dome. palette: [4, 3] linear RGB of both.
-    fixtures: belong to the background; fixture i is its part -2 - i.
+    sun: [3] unit vector towards the light. noise: that of the ground and the dome. palette: [4, 3] linear RGB of both.
+    fixtures: things of the background; fixture i is its part -2 - i.
     """
 
     things: tuple[Thing[Solid], ...]
@@ -54,12 +54,13 @@ class Still(Scene):
 
 
 def turn_z(angle: float) -> np.ndarray:
+    """Return the rotation [3, 3] about z by an angle in radians."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _textures(names: list[str], hue: float, noise: Noise, generator: np.random.Generator) -> dict[str, Texture]:
-    # Related hues, dealt out at random: colour alone does not show where one object ends and the next begins.
+    # The hues are alike and assigned at random, so that colour alone does not separate the objects.
     hues = hue + HUE_RANGE * (generator.permutation(len(names)) / len(names) - 0.5)
     patterns = {
         "box": checks(6.5),
@@ -83,10 +84,10 @@ def _textures(names: list[str], hue: float, noise: Noise, generator: np.random.G
 
 
 def make_still(seed: int) -> Still:
-    """Make the scene of a seed, which decides sizes, places, turn, handedness, colours, textures and light.
+    """Make the scene of a seed, which decides sizes, positions, rotation, mirroring, colours, textures and light.
 
-    All objects stand on flat faces, which no photo shows: only their class keeps their Gaussians out of what is below.
-    The scene is built about a box at the origin, then moved to the middle, mirrored or not, and turned.
+    All objects stand on flat faces, which no photo shows: only their class keeps Gaussians out of the surface below.
+    The scene is built around a box at the origin, then moved to the middle, perhaps mirrored, and turned.
     """
     generator = np.random.default_rng([seed, 1])
 
@@ -106,11 +107,11 @@ def make_still(seed: int) -> Still:
 
     def upright(name: str, outline: tuple[Primitive, ...], cut: tuple[Primitive, ...], reach: float, half: float,
                 position: tuple[float, float, float], on: str) -> None:  # fmt: skip
-        """Place a solid about its own z axis, 2 half high and within ``reach`` of it, with its foot at ``position``."""
+        """Place a solid around its own z axis, 2 half high, within ``reach`` of it, with its foot at ``position``."""
         x, y, z = position
         solid = Solid((*outline, *slab(2, -half, half)), cut, bound=float(np.hypot(reach, half)))
         place(name, solid, [x, y, z + half], turn_z(generator.uniform(0.0, 2.0 * np.pi)))
-        touch(name, on, [x + 0.9 * reach, y, z])  # on the foot of a hollow solid too
+        touch(name, on, [x + 0.9 * reach, y, z])  # The foot of a hollow solid contains this point too.
 
     hx, hy, top = about(0.24, 0.04), about(0.20, 0.04), about(0.30)
     box = (*slab(0, -hx, hx), *slab(1, -hy, hy), *slab(2, -top / 2, top / 2))
@@ -155,7 +156,7 @@ def _finish(
     contacts: list[tuple[str, str, np.ndarray]],
     generator: np.random.Generator,
 ) -> Still:
-    """Move the scene to the middle, mirror and turn it, and give it colours and light."""
+    """Move the scene to the middle, mirror and turn it, and add colours and light."""
     # All solids are symmetric about their own y = 0, so mirroring a pose (M R M, M t) mirrors the object exactly.
     mirror = np.diag([1.0, generator.choice([-1.0, 1.0]), 1.0])
     turn = turn_z(generator.uniform(0.0, 2.0 * np.pi))

@@ -1,6 +1,6 @@
-"""Degraded masks, as wrong as real ones: ragged boundaries, swapped pieces, views left out.
+"""Degrade masks like those of real segmenters: ragged boundaries, swapped pieces, missing masks.
 
-Everything is decided by the seed and the view's name, so one view's mask does not depend on the others.
+The seed and the view's name decide everything, so one view's mask does not depend on the others.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from beags_plugin.system.errors import UserError, check_choice
 
 @dataclass(frozen=True)
 class Degradation:
-    """Amounts by which masks are wrong.
+    """Amounts of mask errors.
 
-    rim: farthest a boundary moves, as a fraction of the image diagonal (0.0075 is 3 pixels at 320 x 240).
-    dropped: fraction of the train views that have no mask.
-    swapped: probability, per object and view, that a piece of it carries another id.
+    rim: largest move of a boundary, over the image diagonal (0.0075 is 3 pixels at 320 x 240).
+    dropped: share of the train views without a mask.
+    swapped: probability, per object and view, that a piece of it has another id.
     """
 
     rim: float = 0.0
@@ -31,24 +31,15 @@ class Degradation:
     swapped: float = 0.0
 
 
-PRESETS = {  # in the order of their degree: 0, 1, 2
+PRESETS = {  # The order is that of their degrees: 0, 1, 2.
     "none": Degradation(),
     "mild": Degradation(rim=0.004, dropped=0.05, swapped=0.04),
     "strong": Degradation(rim=0.009, dropped=0.2, swapped=0.12),
 }
 
 
-@dataclass(frozen=True)
-class Swap:
-    """A connected piece of ``pixels`` pixels of object ``class_id`` that was given ``new_id`` (0: background)."""
-
-    class_id: int
-    new_id: int
-    pixels: int
-
-
 def degradation_of_degree(degree: float) -> Degradation:
-    """Interpolate the presets: degree 0 is "none", 1 "mild", 2 "strong", with straight lines between and beyond.
+    """Interpolate the presets linearly: degree 0 is "none", 1 "mild", 2 "strong"; above 2, extrapolate.
 
     Raises ``UserError`` for a degree below 0, or so high that a share would exceed 1.
     """
@@ -64,7 +55,7 @@ def degradation_of_degree(degree: float) -> Degradation:
 
 
 def resolve_degradation(degradation: str | Degradation) -> Degradation:
-    """Return a preset or a degree (a number) by name, or a custom one; raise ``UserError`` for an invalid one."""
+    """Return the degradation of a preset's name or of a degree as text, or a custom one; check its values."""
     if isinstance(degradation, str):
         with suppress(ValueError):
             return degradation_of_degree(float(degradation))
@@ -79,14 +70,9 @@ def resolve_degradation(degradation: str | Degradation) -> Degradation:
 
 
 def dropped_views(names: Sequence[str], seed: int, fraction: float) -> set[str]:
-    """Return the ``round(fraction * len(names))`` names, but never all, whose lot (by seed and name) is lowest."""
+    """Return ``round(fraction * len(names))`` of the names, but never all, chosen by seed and name."""
     count = min(round(fraction * len(names)), len(names) - 1)
     return lowest_lots(names, seed, max(count, 0), 3)
-
-
-def rim_amplitude(strength: float, height: int, width: int) -> float:
-    """Return the farthest displacement in pixels for a ``Degradation.rim`` in an image of this size."""
-    return strength * math.hypot(height, width)
 
 
 def roughen_rims(labels: np.ndarray, amplitude: float, seed: int, view: str) -> np.ndarray:
@@ -100,9 +86,9 @@ def roughen_rims(labels: np.ndarray, amplitude: float, seed: int, view: str) -> 
     height, width = labels.shape
     noise = Noise(view_generator(seed, view, 4))
     y, x = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
-    cell = max(3.0 * amplitude, 4.0)  # pixels per lattice cell: at least 4, or the boundary turns to salt and pepper
+    cell = max(3.0 * amplitude, 4.0)  # pixels per lattice cell; fewer than 4 would give isolated pixels
     points = np.stack([x.ravel() / cell, y.ravel() / cell, np.zeros(x.size)], axis=1)
-    # Planes 10 lattice cells apart are unrelated; the noise is stretched, as middle values are the most frequent.
+    # Planes 10 lattice cells apart are independent; the noise is stretched, because middle values are most frequent.
     shift = [np.clip(3.0 * (noise(points + [0.0, 0.0, plane]) - 0.5), -1.0, 1.0) for plane in (0.0, 10.0)]
     length = np.maximum(np.hypot(shift[0], shift[1]), 1.0)
     dx, dy = (amplitude * (s / length).reshape(height, width) for s in shift)
@@ -111,22 +97,18 @@ def roughen_rims(labels: np.ndarray, amplitude: float, seed: int, view: str) -> 
     return labels[row, column]
 
 
-def swap_pieces(
-    labels: np.ndarray, num_classes: int, probability: float, seed: int, view: str
-) -> tuple[np.ndarray, list[Swap]]:
-    """Give one connected piece of some objects another object's id or the background's.
+def swap_pieces(labels: np.ndarray, num_classes: int, probability: float, seed: int, view: str) -> np.ndarray:
+    """Return labels in which one connected piece of some objects has the id of another object or the background.
 
-    labels: [H, W] ids in 0..num_classes - 1. Each object present is hit with ``probability``; the piece is the largest
-    connected part of what a random line cuts off (15 to 60 percent of the visible object).
-    Returns the new labels and what was done.
+    labels: [H, W] ids in 0..num_classes - 1. Each object present is chosen with ``probability``; the piece is the
+    largest connected part that a random line cuts off (15 to 60 percent of the visible object).
     """
     from scipy import ndimage
 
     out = labels.copy()
-    swaps = []
     generator = view_generator(seed, view, 5)
     for class_id in range(1, num_classes):
-        # Drawn for absent objects too, so that each object's fate does not depend on the others' presence.
+        # Absent objects take random numbers too, so that each object's swap does not depend on the others' presence.
         chance, angle, share, other = generator.random(4)
         rows, columns = np.nonzero(labels == class_id)
         if chance >= probability or len(rows) == 0:
@@ -139,16 +121,14 @@ def swap_pieces(
         piece = pieces == 1 + np.argmax(np.bincount(pieces.ravel())[1:])
         # Half of the pieces are lost to the background, the rest go to any other object.
         others = [i for i in range(1, num_classes) if i != class_id]
-        new_id = 0 if other < 0.5 or not others else others[int((2.0 * other - 1.0) * len(others))]
-        out[piece] = new_id
-        swaps.append(Swap(class_id, new_id, int(np.count_nonzero(piece))))
-    return out, swaps
+        out[piece] = 0 if other < 0.5 or not others else others[int((2.0 * other - 1.0) * len(others))]
+    return out
 
 
 def degrade_mask(labels: np.ndarray, num_classes: int, degradation: Degradation, seed: int, view: str) -> np.ndarray:
-    """Swap pieces, then make boundaries ragged; ``dropped_views`` leaves views out.
+    """Swap pieces, then make boundaries ragged; ``dropped_views`` chooses the views without a mask.
 
     labels: [H, W] ids. Returns the same shape and type.
     """
-    swapped, _ = swap_pieces(labels, num_classes, degradation.swapped, seed, view)
-    return roughen_rims(swapped, rim_amplitude(degradation.rim, *labels.shape), seed, view)
+    swapped = swap_pieces(labels, num_classes, degradation.swapped, seed, view)
+    return roughen_rims(swapped, degradation.rim * math.hypot(*labels.shape), seed, view)

@@ -1,4 +1,4 @@
-"""A desk in the room: six of the room's things put together so that they touch, for photos from all around."""
+"""A desk in the room, with six of the room's things that touch, for photos from all around."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from beags_plugin.sample.room_things import Group, Stock, make_groups
 from beags_plugin.sample.scene import Contact, Thing
 from beags_plugin.sample.solids import turned
 from beags_plugin.sample.textures import Noise
-from beags_plugin.sample.views import View, held_out, look_at, make_view
+from beags_plugin.sample.views import View, direction, held_out, look_at, make_view
 
 ELEVATIONS = (0.24, 0.52, 0.84)
-"""Radians above the desk of the three rounds of cameras."""
+"""Elevations of the three rounds of cameras above the desk, radians."""
 TARGET = np.array([0.0, 0.0, 0.16])
 DISTANCE, LENS = 1.70, 1.22
-"""World units from the target, so that cameras stand before the nearest wall; focal length over width."""
+"""Distance of cameras from the target, world units, so that no wall is in between; focal length over width."""
 TABLE = -1  # part of the background, see ``Room``
 SPACING_THINGS, SPACING_TABLE, SPACING_ROOM = 0.012, 0.03, 0.1
-"""World units between the places where light is measured."""
+"""Distance of the points where light is measured, world units."""
 
 
 def make_desk(seed: int) -> Room:
-    """Make the desk of a seed, which decides sizes, places, turns, textures and colours.
+    """Make the desk of a seed, which decides sizes, positions, rotations, textures and colours.
 
     A book leans on a crate with a star on it; a mug, a vase and a ball touch the crate's other sides.
     """
@@ -45,13 +45,13 @@ def make_desk(seed: int) -> Room:
     things: list[Thing[Mesh]] = []
     contacts: list[Contact] = []
     add_group(things, contacts, groups[0], turn, -turn @ (crate.position * [1.0, 1.0, 0.0]))
-    # Each stands near an end of its side, so that photos show the other end, and the mug's handle points along it.
+    # Each thing stands near an end of its side, so that photos show the other end; the mug's handle points along it.
     for name, face, gap, steps, along in (
         ("mug", 0.5 * np.pi, x, 0, generator.uniform(-0.08, -0.02)),
         ("vase", 0.0, y, generator.integers(SEGMENTS), generator.uniform(-0.12, -0.07)),
         ("ball", np.pi, y, generator.integers(SEGMENTS), generator.uniform(-0.12, -0.06)),
     ):
-        spin, way = turn_z(2.0 * np.pi * steps / SEGMENTS), turn @ turn_z(face)  # y is away from the crate
+        spin, way = turn_z(2.0 * np.pi * steps / SEGMENTS), turn @ turn_z(face)  # y points away from the crate.
         corners = turned(named[name].solid.vertices, spin.T)
         nearest = corners[np.argmin(corners[:, 1].round(9))]
         shift = np.array([along, gap - nearest[1], 0.0])
@@ -70,19 +70,18 @@ def _standing(thing: Thing[Mesh]) -> Group:
 
 
 class DeskLight(RoomLight):
-    """The light of a room, measured once on a grid over all surfaces: many photos need no further rays for it."""
+    """The light of a room, measured once on a grid over all surfaces, so that many photos need no further rays."""
 
-    def __init__(self, room: Room, lamp_samples: int = 24, bounce_samples: int = 16) -> None:
-        super().__init__(room, lamp_samples, bounce_samples)
+    def __init__(self, room: Room) -> None:
+        super().__init__(room)
         self._maps: dict[int, LightMap] = {}
         self._lock = Lock()
         parts = [*range(1, len(room.things) + 1), *(-1 - i for i in range(len(room.fixtures))), SHELL]
-        self._parts = {which: number for number, which in enumerate(parts)}  # as ``RoomLight`` gives them to Open3D
+        self._parts = {which: number for number, which in enumerate(parts)}  # the order of ``RoomLight`` in Open3D
 
     def colours(
         self, points: np.ndarray, surface: np.ndarray, directions: np.ndarray, center: np.ndarray
     ) -> np.ndarray:
-        """See ``scene.Lighting``."""
         colours = np.empty_like(points)
         for which in np.unique(surface):
             on = np.flatnonzero(surface == which)
@@ -90,16 +89,15 @@ class DeskLight(RoomLight):
                 shell = self.room.shell
                 local, way = shell.to_local(points[on]), turned(directions[on], shell.turn)
             else:
-                thing = self._thing(which)
+                thing = self.room.part(which)
                 local, way = thing.to_local(points[on]), turned(directions[on], thing.rotation)
             colours[on] = self._albedo(which, local) * self._map(which).read(local, way)
         return colours
 
     def seen(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """See ``scene.DirectLighting``."""
-        found = self._blockers.cast_rays(rays(origin[None], directions))
-        part, triangle = (found[name].numpy().astype(np.int64) for name in ("geometry_ids", "primitive_ids"))
-        weights, colours = found["primitive_uvs"].numpy().astype(np.float64), np.zeros_like(directions)
+        hits = self._blockers.cast_rays(rays(origin[None], directions))
+        part, triangle = (hits[name].numpy().astype(np.int64) for name in ("geometry_ids", "primitive_ids"))
+        weights, colours = hits["primitive_uvs"].numpy().astype(np.float64), np.zeros_like(directions)
         for which, number in self._parts.items():
             on = np.flatnonzero(part == number)  # A ray that slips through an edge of the shell stays black.
             if len(on):
@@ -111,13 +109,10 @@ class DeskLight(RoomLight):
         return colours
 
     def _albedo(self, which: int, local: np.ndarray) -> np.ndarray:
-        return self._paper(local) if which == SHELL else self._thing(which).texture(local)
-
-    def _thing(self, which: int) -> Thing[Mesh]:
-        return self.room.things[which - 1] if which > 0 else self.room.fixtures[-1 - which]
+        return self._paper(local) if which == SHELL else self.room.part(which).texture(local)
 
     def _map(self, which: int) -> LightMap:
-        """Return the light of a part, as in ``Hits.surface``, which its first reader has measured."""
+        """Return the light of a part, as in ``Hits.surface``; the first call measures it."""
         with self._lock:
             if which not in self._maps:
                 self._maps[which] = self._baked(which)
@@ -129,12 +124,12 @@ class DeskLight(RoomLight):
             inwards = Mesh(block(shell.half[0], shell.half[1], -shell.half[2], shell.half[2]))
             inwards.face_normals *= -1.0
             return LightMap(inwards, SPACING_ROOM, self._measure(shell.turn, shell.turn @ shell.middle))
-        thing = self._thing(which)
+        thing = self.room.part(which)
         spacing = SPACING_THINGS if which > 0 else SPACING_TABLE if which == TABLE else SPACING_ROOM
         return LightMap(thing.solid, spacing, self._measure(thing.rotation, thing.position))
 
     def _measure(self, rotation: np.ndarray, position: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-        """Return what measures light in the frame of a thing, by all of the lamp and all ways around."""
+        """Return a function that measures light in the frame of a thing, with all samples of lamp and surroundings."""
 
         def measure(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
             places, ways = turned(points, rotation.T) + position, turned(normals, rotation.T)
@@ -144,7 +139,7 @@ class DeskLight(RoomLight):
 
 
 def desk_views(seed: int, width: int, height: int, num_train: int, num_test: int) -> list[View]:
-    """Make three jittered rounds about the desk at rising height, with test views spread evenly."""
+    """Make three jittered rounds around the desk at rising height, with test views spread evenly."""
     generator = np.random.default_rng([seed, 2])
     total, tests = num_train + num_test, held_out(num_train, num_test)
     start = generator.uniform(0.0, 2.0 * np.pi)
@@ -155,8 +150,8 @@ def desk_views(seed: int, width: int, height: int, num_train: int, num_test: int
         spread = generator.uniform(-1.0, 1.0, 7)
         azimuth = start + 2.0 * np.pi * (progress + level / 8.0) + 0.05 * spread[0]
         elevation = ELEVATIONS[level] + 0.04 * spread[1]
-        way = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
         target = TARGET + 0.05 * spread[2:5]
-        pose = look_at(target + DISTANCE * (1.0 + 0.04 * spread[5]) * way, target, 0.04 * spread[6])
+        place = target + DISTANCE * (1.0 + 0.04 * spread[5]) * direction(azimuth, elevation)
+        pose = look_at(place, target, 0.04 * spread[6])
         views.append(make_view(i, i in tests, pose, LENS, width, height))
     return views

@@ -1,4 +1,4 @@
-"""The families of generated scenes: how each makes a scene, its light and its views from a seed."""
+"""The families of generated scenes: each makes a scene, its light and its views from a seed."""
 
 from __future__ import annotations
 
@@ -9,18 +9,17 @@ from typing import Any
 from beags_plugin.sample.arrangement import make_still
 from beags_plugin.sample.desk import DeskLight, desk_views, make_desk
 from beags_plugin.sample.lighting import Light, TurntableLight
-from beags_plugin.sample.room import make_room
+from beags_plugin.sample.room import make_room, room_views
 from beags_plugin.sample.room_light import RoomLight
-from beags_plugin.sample.room_views import room_views
 from beags_plugin.sample.scene import Lighting, Scene
 from beags_plugin.sample.views import View, make_views
 
 
 @dataclass(frozen=True)
 class Family:
-    """scene: from the seed. light: of such a scene, or of one with objects left out. views: as ``make_views``.
+    """Functions that make a family's scene of a seed, the light of such a scene, and its views as ``make_views``.
 
-    turns: whether the background stands with the camera while the objects turn.
+    turns: whether the background stands still with the camera while the objects turn.
     """
 
     scene: Callable[[int], Scene]

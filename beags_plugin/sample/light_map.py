@@ -1,4 +1,4 @@
-"""Light baked on the triangles of a mesh: measured once at the points of a grid on each, and read between them."""
+"""Light baked on the triangles of a mesh: measured once at the points of a grid on each, and interpolated."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy import sparse
 from beags_plugin.sample.meshes import Mesh
 from beags_plugin.sample.solids import dot
 
-FLAT = 0.77  # cosine of the angle between faces up to which their common edge is smooth
+FLAT = 0.77  # least cosine between the normals of faces whose common edge is smooth
 
 Measure = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """From surface points [N, 3] and unit normals [N, 3], in the mesh's frame, to their light [N, 3]."""
@@ -24,26 +24,26 @@ class LightMap:
         self.mesh = mesh
         corners = mesh.vertices[mesh.triangles]
         edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-        # Each triangle's sides are divided into so many steps.
+        # _steps holds the number of steps into which each triangle's sides are divided.
         self._steps = np.maximum(np.ceil(edges.max(axis=1) / spacing), 1.0).astype(np.int64)
         sizes = (self._steps + 1) ** 2
         self._first = np.cumsum(sizes) - sizes
         self._light = np.zeros((int(sizes.sum()), 3), dtype=np.float32)
-        bent = smooth_normals(mesh)
+        smooth = smooth_normals(mesh)
         for steps in np.unique(self._steps):
             of = np.flatnonzero(self._steps == steps)
             i, j = np.nonzero(np.add.outer(np.arange(steps + 1), np.arange(steps + 1)) <= steps)
             weights = np.stack([steps - i - j, i, j], axis=1) / steps
             points = np.einsum("sk,tkd->tsd", weights, corners[of]).reshape(-1, 3)
-            normals = np.einsum("sk,tkd->tsd", weights, bent[of]).reshape(-1, 3)
+            normals = np.einsum("sk,tkd->tsd", weights, smooth[of]).reshape(-1, 3)
             normals /= np.linalg.norm(normals, axis=1, keepdims=True)
             places = (self._first[of, None] + i * (steps + 1) + j).ravel()
             self._light[places] = measure(points, normals)
 
     def read(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return the light [N, 3] at surface points [N, 3] that rays along ``directions`` [N, 3] hit first; own frame.
+        """Return the light [N, 3] at surface points [N, 3] that rays along ``directions`` [N, 3] hit first.
 
-        Points that rounding moved past an edge get the light of the mesh's first corner.
+        Both are in the mesh's frame. Points that rounding moved past an edge get the light of the mesh's first corner.
         """
         hit, triangle, weights = self.mesh.land(points, directions)
         light = np.broadcast_to(self._light[0], points.shape).copy()
@@ -56,7 +56,7 @@ class LightMap:
         place = np.clip(weights, 0.0, 1.0) * steps[:, None]
         cell = np.minimum(place.astype(np.int64), steps[:, None] - 1)
         (i, j), (u, v) = cell.T, (place - cell).T
-        far = (u + v > 1.0) & (i + j + 2 <= steps)  # The cell's second half, where it lies inside the triangle.
+        far = (u + v > 1.0) & (i + j + 2 <= steps)  # the cell's second half, where it lies inside the triangle
         row = steps + 1
         start = self._first[triangle] + i * row + j
         base = np.where(far, start + row + 1, start)
@@ -70,7 +70,7 @@ class LightMap:
 def smooth_normals(mesh: Mesh) -> np.ndarray:
     """Return unit normals [T, 3, 3] at each triangle's corners: means over the triangles that meet there nearly flat.
 
-    So a turned shape looks round, though its faces are flat, and edges stay sharp.
+    Turned shapes with flat faces then look round, and edges stay sharp.
     """
     corners, faces = mesh.vertices[mesh.triangles], np.arange(len(mesh.triangles))
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)

@@ -1,4 +1,4 @@
-"""Colours of surface points: diffuse, a soft-edged sun, sky light; the same from every view."""
+"""Colours of surface points: diffuse reflection of a soft-edged sun and sky light, the same from every view."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from beags_plugin.sample.tracing import seen_share
 
 SUN = np.array([1.22, 1.13, 1.0])
 SKY = np.array([0.36, 0.39, 0.44])
-SUN_RADIUS = 0.10  # radians: the width of penumbras
-LIFT = 1e-4  # world units off the surface, so that shadow rays do not hit where they start
+SUN_RADIUS = 0.10  # radians, which sets the width of penumbras
+LIFT = 1e-4  # distance from the surface at which shadow rays start, so that they do not hit it; world units
 TILES = 2.5  # tiles of the ground per unit
 MAP_EXTENT, MAP_CELLS = 2.0, 160
-"""The ground's light is baked over |x|, |y| <= 2.0 units; no shadow reaches farther."""
+"""The ground's light is baked for |x|, |y| <= 2.0 units; no shadow reaches farther."""
 
 
 def _sun_directions(sun: np.ndarray, count: int) -> np.ndarray:
@@ -30,14 +30,14 @@ def _sun_directions(sun: np.ndarray, count: int) -> np.ndarray:
 
 
 def _sky_directions(count: int) -> np.ndarray:
-    """Return [count, 3] unit vectors about +z, their density proportional to the cosine."""
+    """Return [count, 3] unit vectors around +z, with a density proportional to the cosine."""
     radius = np.sqrt((np.arange(count) + 0.5) / count)
     angle = 2.399963 * np.arange(count)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - radius**2)], axis=1)
 
 
 class Light:
-    """The light of a still life, with the ground's share baked into a map once."""
+    """The light of a still life, with that of the ground baked into a map once."""
 
     def __init__(self, still: Still, object_samples: int = 8, ground_samples: int = 24) -> None:
         self.still = still
@@ -64,18 +64,18 @@ class Light:
         return albedo * (sun[:, None] * SUN + sky[:, None] * SKY)
 
     def _standing(self, points: np.ndarray, center: np.ndarray) -> np.ndarray:
-        """Return background points [N, 3] in the room's frame, as a camera at ``center`` [3] sees them."""
+        """Return background points [N, 3] in the background's frame, as a camera at ``center`` [3] sees them."""
         return points
 
     def _ground(self, place: np.ndarray, center: np.ndarray) -> np.ndarray:
-        """Colour tiles of mottled stone, whose pattern fades outwards, where small images would alias."""
+        """Return the colours of mottled stone tiles, whose pattern fades outwards, where small images would alias."""
         palette, noise = self.still.palette, self.still.noise
         points = self._standing(place, center)
         tile = points[:, :2] * TILES
         cell = np.floor(tile)
         flat = np.zeros_like(points)
         flat[:, :2] = cell * 3.7 + 0.5
-        shade = noise(flat)  # constant over a tile
+        shade = noise(flat)  # a tone per tile
         flat[:, :2] = points[:, :2] * 7.0
         stone = noise(flat)
         flat[:, :2] = points[:, :2] * 2.3 + 9.1
@@ -87,11 +87,11 @@ class Light:
         joint = fade * (np.max(np.abs(tile - cell - 0.5), axis=1) > 0.465)
         albedo = albedo * (1.0 - 0.5 * joint)[:, None]
         sun = self._read(self._sun_map, place) * self.still.sun[2]
-        sky = 0.15 + 0.85 * self._read(self._sky_map, place)  # some light is thrown back everywhere
+        sky = 0.15 + 0.85 * self._read(self._sky_map, place)  # Some light is reflected everywhere.
         return self._lit(albedo, sun, sky)
 
     def _dome(self, points: np.ndarray, center: np.ndarray) -> np.ndarray:
-        """Colour a curtain of soft folds with clouds of colour, which shines by itself and has no shading."""
+        """Return the colours of a glowing curtain of soft folds and clouds of colour, without shading."""
         palette, noise = self.still.palette, self.still.noise
         points = self._standing(points, center)
         height = points[:, 2] / DOME_RADIUS
@@ -110,14 +110,13 @@ class Light:
         bright = np.flatnonzero(cosine > 0.0)
         lifted = points[bright] + LIFT * normals[bright]
         sun[bright] = cosine[bright] * seen_share(self._blockers, lifted, self._suns)
-        # Sky light by tilt, dimmed close to the ground: a cheap stand-in for ambient occlusion.
+        # Sky light depends on the tilt, and is dimmed near the ground in place of ambient occlusion.
         sky = (0.62 + 0.38 * normals[:, 2]) * (0.55 + 0.45 * np.clip(points[:, 2] / 0.25, 0.0, 1.0))
         return self._lit(thing.texture(local), sun, sky)
 
     def colours(
         self, points: np.ndarray, surface: np.ndarray, directions: np.ndarray, center: np.ndarray
     ) -> np.ndarray:
-        """See ``scene.Lighting``."""
         colours = np.empty_like(points)
         for which in np.unique(surface):
             chosen = np.flatnonzero(surface == which)
@@ -132,9 +131,9 @@ class Light:
 
 
 class TurntableLight(Light):
-    """The light of a still life that turns before a camera: ground and curtain stand as the camera does.
+    """The light of a still life that turns before a fixed camera, while ground and curtain stand still.
 
-    The lamps turn with the objects, so that they keep their shading and their shadows.
+    The lamps turn with the objects, so that shading and shadows stay the same.
     """
 
     def _standing(self, points: np.ndarray, center: np.ndarray) -> np.ndarray:

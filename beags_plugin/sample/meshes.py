@@ -1,6 +1,6 @@
 """Closed triangle meshes by turning, extruding and sweeping outlines, traced by Open3D.
 
-Open3D finds which triangle a ray meets, in float32; where on its plane is computed in float64.
+Open3D finds the triangle that a ray meets, in float32; the point on its plane is computed in float64.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from beags_plugin.sample.solids import dot
 
-SEGMENTS = 64  # of a turned shape, a multiple of 8: vertices lie on both axes and on the diagonals
+SEGMENTS = 64  # segments of a turned shape: a multiple of 8, so that vertices lie on both axes and on the diagonals
 Part = tuple[np.ndarray, np.ndarray]
 """vertices [V, 3] float64 and triangles [T, 3] int64 of one closed surface."""
 
@@ -27,15 +27,15 @@ def _quilt(grid: np.ndarray, closed: bool) -> Part:
     vertices = grid.reshape(-1, 3)
     p, q, r = (vertices[triangles[:, k]] for k in range(3))
     cross = np.cross(q - p, r - p)
-    triangles = triangles[dot(cross, cross) > 1e-24]  # at a pole quads are triangles
+    triangles = triangles[dot(cross, cross) > 1e-24]  # At a pole, quads are triangles.
     volume = np.sum(dot(p, np.cross(q, r)))
     return vertices, triangles if volume > 0.0 else triangles[:, ::-1]
 
 
 def lathe(profile: np.ndarray, flat: np.ndarray | None = None) -> Part:
-    """Turn a profile [P, 2] of (radius, z) about the z axis; it begins and ends on the axis.
+    """Turn a profile [P, 2] of (radius, z), which begins and ends on the axis, about the z axis.
 
-    flat: [P] factors of y, for a shape that is no longer round.
+    flat: [P] factors of y, for a shape that is not round.
     """
     angle = 2.0 * np.pi * np.arange(SEGMENTS) / SEGMENTS
     radius, z = profile[:, :1], np.repeat(profile[:, 1:], SEGMENTS, axis=1)
@@ -44,9 +44,9 @@ def lathe(profile: np.ndarray, flat: np.ndarray | None = None) -> Part:
 
 
 def extrude(outer: np.ndarray, inner: np.ndarray | float, low: float, high: float) -> Part:
-    """Extrude the band between two outlines [P, 2] along z from ``low`` to ``high``; inner 0.0 leaves no hole.
+    """Extrude the band between two outlines [P, 2] along z from ``low`` to ``high``; inner 0.0: without a hole.
 
-    Without a hole the outline must be visible from (0, 0) all round.
+    Without a hole, all of the outline must be visible from (0, 0).
     """
     hole = np.zeros_like(outer) + inner
     rings = [(outer, low), (outer, high), (hole, high), (hole, low)]
@@ -63,7 +63,7 @@ def sweep(path: np.ndarray, radius: float, around: int = 16) -> Part:
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     angle = 2.0 * np.pi * np.arange(around) / around
-    out = np.stack([-tangent[:, 1], np.zeros(len(path)), tangent[:, 0]], axis=1)  # in the plane, across the path
+    out = np.stack([-tangent[:, 1], np.zeros(len(path)), tangent[:, 0]], axis=1)  # normals of the path in its plane
     ring = np.cos(angle)[:, None] * out[:, None] + np.sin(angle)[:, None] * np.array([0.0, 1.0, 0.0])
     centre = np.stack([path[:, 0], np.zeros(len(path)), path[:, 1]], axis=1)[:, None]
     tube = centre + radius * ring
@@ -72,12 +72,12 @@ def sweep(path: np.ndarray, radius: float, around: int = 16) -> Part:
 
 
 def moved(part: Part, by: tuple[float, float, float]) -> Part:
-    """Return the part shifted."""
+    """Return the part moved by a vector."""
     return part[0] + np.array(by), part[1]
 
 
 class Mesh:
-    """A body made of closed parts, which may run into one another; a solid for ``arrangement.Thing``."""
+    """A body made of closed parts, which may intersect; a solid for ``scene.Thing``."""
 
     def __init__(self, *parts: Part) -> None:
         offsets = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
@@ -93,42 +93,38 @@ class Mesh:
         """Return Open3D's scene of this mesh alone."""
         return raycaster([(self.vertices, self.triangles)])
 
-    def _cast(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rays that hit and the triangles that they hit first."""
-        return self._cast_to(origins, directions)[:2]
-
-    def _cast_to(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the rays that hit, the triangles that they hit first, and where: weights [M, 2] of corners 1 and 2."""
-        found = self.caster.cast_rays(rays(origins, directions))
-        triangle = found["primitive_ids"].numpy()
+    def _cast(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the rays that hit, the triangles that they hit first, and the weights [M, 2] of corners 1 and 2."""
+        hits = self.caster.cast_rays(rays(origins, directions))
+        triangle = hits["primitive_ids"].numpy()
         hit = np.flatnonzero(triangle < len(self.triangles))
-        return hit, triangle[hit].astype(np.int64), found["primitive_uvs"].numpy()[hit]
+        return hit, triangle[hit].astype(np.int64), hits["primitive_uvs"].numpy()[hit]
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return [N] smallest t > 0 at which rays from outside enter the body, infinity if none."""
-        hit, triangle = self._cast(origins, directions)
+        hit, triangle, _ = self._cast(origins, directions)
         normals, corner = self.face_normals[triangle], self.vertices[self.triangles[triangle, 0]]
         start = origins if len(origins) == 1 else origins[hit]
         t = np.full(len(directions), np.inf)
         with np.errstate(divide="ignore", invalid="ignore"):
-            found = dot(corner - start, normals) / dot(directions[hit], normals)
-        t[hit] = np.where(found > 0.0, found, np.inf)
+            distance = dot(corner - start, normals) / dot(directions[hit], normals)
+        t[hit] = np.where(distance > 0.0, distance, np.inf)
         return t
 
     def normals(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return [N, 3] outward unit normals at surface points that rays along ``directions`` [N, 3] hit first."""
         hit, triangle, _ = self.land(points, directions)
         normals = -directions / np.linalg.norm(directions, axis=1, keepdims=True)
-        normals[hit] = self.face_normals[triangle]  # where rounding does not let the ray slip past an edge
+        normals[hit] = self.face_normals[triangle]  # Rounding lets few rays slip past an edge.
         return normals
 
     def land(self, points: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find surface points that rays along ``directions`` [N, 3] hit first: which, on which triangle, and where.
+        """Find the triangles of surface points [N, 3] that rays along ``directions`` [N, 3] hit first.
 
-        Returns indices [M], triangles [M] and the weights [M, 2] of these triangles' corners 1 and 2.
+        Returns indices of points [M], triangles [M] and the weights [M, 2] of these triangles' corners 1 and 2.
         """
         way = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-        return self._cast_to(points - 1e-3 * way, way)
+        return self._cast(points - 1e-3 * way, way)
 
 
 def rays(origins: np.ndarray, directions: np.ndarray) -> Any:
@@ -146,5 +142,5 @@ def raycaster(parts: list[Part]) -> Any:
     scene, tensor = open3d.t.geometry.RaycastingScene(), open3d.core.Tensor
     for vertices, triangles in parts:
         scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(triangles.astype(np.uint32)))
-    scene.cast_rays(tensor(np.zeros((1, 6), np.float32)))  # The first rays build its tree, which no two threads may do.
+    scene.cast_rays(tensor(np.zeros((1, 6), np.float32)))  # The first rays build its tree, which is not thread-safe.
     return scene

@@ -1,4 +1,4 @@
-"""Seed points such as structure from motion would give, and the photos that show each."""
+"""Seed points like those of structure from motion, and the photos that show each."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class SeedPoints:
     """Seed points of one photo.
 
     records: [P] of x, y, z (float32, world) and red, green, blue, with noise. places: [P, 3] world, without noise.
-    pixels: [P] of the photo, row by row. on_objects: [P] bool.
+    pixels: [P] indices of the photo's pixels, row by row. on_objects: [P] bool.
     """
 
     records: np.ndarray
@@ -25,7 +25,7 @@ class SeedPoints:
     on_objects: np.ndarray
 
     def paint(self, colours: np.ndarray) -> None:
-        """Give the points colours [P, 3] uint8."""
+        """Set the points' colours [P, 3] uint8."""
         for channel, name in enumerate(("red", "green", "blue")):
             self.records[name] = colours[:, channel]
 
@@ -33,9 +33,9 @@ class SeedPoints:
 def seed_points(
     view: View, picture: Picture, lasting: np.ndarray, count: int, noise: float, generator: np.random.Generator
 ) -> SeedPoints:
-    """Sample ``count`` visible surface points of a view with noise, half of them on objects, where there are any.
+    """Sample ``count`` visible surface points of a view with noise, half of them on objects, if there are any.
 
-    lasting: [H, W] bool, pixels to sample from. noise: standard deviation, world units.
+    lasting: [H, W] bool, the background's pixels to sample from. noise: standard deviation, world units.
     """
     labels = picture.labels.ravel()
     objects, rest = np.flatnonzero(labels > 0), np.flatnonzero((labels == 0) & lasting.ravel())
@@ -46,24 +46,25 @@ def seed_points(
     )
     x, y = pixels % view.width + 0.5, pixels // view.width + 0.5
     places = view.center + picture.depth.ravel()[pixels, None].astype(np.float64) * view.directions(x, y)
-    points = places + generator.normal(0.0, noise, places.shape)
+    noisy = places + generator.normal(0.0, noise, places.shape)
     records = np.empty(len(pixels), dtype=[(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")])
     for axis, name in enumerate("xyz"):
-        records[name] = points[:, axis]
-    found = SeedPoints(records, places, pixels, labels[pixels] > 0)
-    found.paint(picture.image.reshape(-1, 3)[pixels])
-    return found
+        records[name] = noisy[:, axis]
+    points = SeedPoints(records, places, pixels, labels[pixels] > 0)
+    points.paint(picture.image.reshape(-1, 3)[pixels])
+    return points
 
 
 def find_tracks(seeds: Sequence[SeedPoints], photos: Sequence[Photo], turns: bool) -> list[list[int]]:
     """Return, for all points of ``seeds``, the indices of the photos that show each: its own, and others.
 
-    seeds: of each photo. turns: whether the background stands with the camera, so that points of it do not last.
+    seeds: the points of each photo. turns: whether the background stands still with the camera, so that its points have
+    no fixed position.
     """
     places = np.concatenate([each.places for each in seeds])
     own = np.repeat(np.arange(len(seeds)), [len(each.places) for each in seeds])
-    shown = np.stack([shown_in(photo, places) for photo in photos], axis=1)
+    visible = np.stack([shown_in(photo, places) for photo in photos], axis=1)
     if turns:
-        shown &= np.concatenate([each.on_objects for each in seeds])[:, None]
-    shown[np.arange(len(places)), own] = True  # rounding must not hide a point from the photo that it was sampled from
-    return [np.flatnonzero(row).tolist() for row in shown]
+        visible &= np.concatenate([each.on_objects for each in seeds])[:, None]
+    visible[np.arange(len(places)), own] = True  # Rounding may hide a point from the photo that it was sampled from.
+    return [np.flatnonzero(row).tolist() for row in visible]

@@ -1,7 +1,7 @@
-"""Image-like surfaces: wood, brick, lettering, posters, book spines, weave; sharp, at several scales.
+"""Image-like surfaces with sharp detail at several scales: wood, brick, lettering, posters, book spines, weave.
 
-A print maps places u, v [N] (world units; v upward) to albedo [N, 3], linear RGB in 0..1. Random choices per cell are
-read from the lattice of ``Noise`` at whole numbers.
+A print maps coordinates u, v [N] (world units; v upward) to albedo [N, 3], linear RGB in 0..1. Random choices per cell
+are values of ``Noise`` at whole numbers.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def lettering(noise: Noise, paper: np.ndarray, ink: np.ndarray, size: float) -> 
 
 
 def poster(noise: Noise, colours: np.ndarray, wide: float, high: float) -> Print:
-    """Return a framed picture about (0, 0): sky, sun, ridges and a line of print; colours [4, 3]."""
+    """Return a framed picture around (0, 0): sky, sun, ridges and a line of print; colours [4, 3]."""
 
     def paint(u: np.ndarray, v: np.ndarray) -> np.ndarray:
         x, y = u / wide + 0.5, v / high + 0.5
@@ -108,13 +108,14 @@ def poster(noise: Noise, colours: np.ndarray, wide: float, high: float) -> Print
     return paint
 
 
-def spines(noise: Noise, colours: np.ndarray, shelf: float = 0.52) -> Print:
+def spines(noise: Noise, colours: np.ndarray) -> Print:
     """Return shelves of books: upright spines of random width, height and colour, with titles; colours [K, 3]."""
+    shelf = 0.52
 
     def paint(u: np.ndarray, v: np.ndarray) -> np.ndarray:
         row = np.floor(v / shelf)
         up = v - row * shelf
-        warped = u + 0.04 * np.sin(9.0 * u + 2.0 * row)  # makes their widths differ
+        warped = u + 0.04 * np.sin(9.0 * u + 2.0 * row)  # Warping makes the widths of books differ.
         book = np.floor(warped / 0.11)
         across = warped / 0.11 - book - 0.5
         kind = _at(noise, book, row, 8.0)
@@ -143,7 +144,7 @@ def weave(noise: Noise, light: np.ndarray, dark: np.ndarray, size: float) -> Pri
 
 
 def carpet(noise: Noise, colours: np.ndarray, wide: float, high: float) -> Print:
-    """Return a rug about (0, 0): borders, and diamonds of four colours [4, 3]."""
+    """Return a rug around (0, 0): borders, and diamonds of four colours [4, 3]."""
 
     def paint(u: np.ndarray, v: np.ndarray) -> np.ndarray:
         edge = np.minimum(0.5 * wide - np.abs(u), 0.5 * high - np.abs(v))
@@ -184,7 +185,7 @@ def within(ground: Print, *panels: tuple[float, float, float, float, Print]) -> 
 
 
 def around(paint: Print, radius: float) -> Paint:
-    """Wrap a print about the z axis of a turned shape; its bottom and lids get the print's own run-out."""
+    """Wrap a print around the z axis of a turned shape; the print continues over its bottom and lid."""
     return lambda p: paint(radius * np.arctan2(p[:, 1], p[:, 0]), p[:, 2] + 0.6 * np.hypot(p[:, 0], p[:, 1]))
 
 

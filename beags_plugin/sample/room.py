@@ -1,6 +1,6 @@
 """A closed room: walls, furniture and, on a table, objects that lean on, stand on and lie in one another.
 
-Cameras pass by on one side of the table, so that photos show some of the room well, some hardly, some not at all.
+Cameras pass on one side of the table, so that photos show parts of the room well, hardly, or not at all.
 """
 
 from __future__ import annotations
@@ -18,10 +18,15 @@ from beags_plugin.sample.scene import Contact, Scene, Thing
 from beags_plugin.sample.solids import turned
 from beags_plugin.sample.textures import Noise, linear_from_hsv
 from beags_plugin.sample.tracing import hit_fixtures
+from beags_plugin.sample.views import View, direction, held_out, look_at, make_view
 
 SHELL = 0
 SLOTS = ((-0.66, 0.34), (0.66, 0.36), (0.0, 0.0), (-0.58, -0.40), (0.58, -0.38))
-"""Places of the groups on the table; its middle is the world's origin."""
+"""Positions of the groups on the table; its middle is the world's origin."""
+ARC = 1.85
+"""Radians to either side of the table's front within which photos are taken."""
+ELEVATIONS = (0.24, 0.50, 0.80)
+TARGET = np.array([0.0, 0.0, 0.14])
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,7 @@ class Shell:
 
     @classmethod
     def of(cls, seed: int) -> Shell:
-        """Return the walls of the room of a seed; the table stands near one of them (+y before the turn)."""
+        """Return the walls of the room of a seed; the table stands near one of them (+y before the rotation)."""
         generator = np.random.default_rng([seed, 11])
         low = np.array([-3.1, -3.3, -1.3]) - generator.uniform(0.0, 0.4, 3) * [1.0, 1.0, 0.0]
         high = np.array([3.1, 1.9, 2.3]) + generator.uniform(0.0, 0.4, 3) * [1.0, 0.5, 0.5]
@@ -47,7 +52,7 @@ class Shell:
 
 @dataclass(frozen=True)
 class Room(Scene):
-    """The walls, what belongs to the background beside them (part -1 - i is fixture i), and the walls' paint."""
+    """The walls, the other things of the background (part -1 - i is fixture i), and the walls' paint."""
 
     things: tuple[Thing[Mesh], ...]
     shell: Shell
@@ -63,9 +68,13 @@ class Room(Scene):
         part = np.full(len(t), SHELL, dtype=np.int32)
         return hit_fixtures(self.fixtures, origin, directions, t, part, SHELL - 1)
 
+    def part(self, which: int) -> Thing[Mesh]:
+        """Return the object of class id ``which``, or below 0 the fixture that is this part of the background."""
+        return self.things[which - 1] if which > 0 else self.fixtures[-1 - which]
+
 
 def make_room(seed: int) -> Room:
-    """Make the room of a seed, which decides sizes, places, turns, textures and colours."""
+    """Make the room of a seed, which decides sizes, positions, rotations, textures and colours."""
     generator = np.random.default_rng([seed, 12])
     shell = Shell.of(seed)
     noise = Noise(generator)
@@ -97,7 +106,7 @@ def furnished(
 def add_group(
     things: list[Thing[Mesh]], contacts: list[Contact], group: Group, turn: np.ndarray, place: np.ndarray
 ) -> None:
-    """Add a group with its contacts, turned and then moved to ``place`` [3], to what a scene has so far."""
+    """Add a group with its contacts, turned and then moved to ``place`` [3], to the things of a scene."""
     ids = {"table": 0}
     for thing in group.things:
         things.append(
@@ -105,6 +114,32 @@ def add_group(
         )
         ids[thing.name] = len(things)
     contacts += [Contact(ids[a], ids[b], turn @ np.array(point) + place) for a, b, point in group.contacts]
+
+
+def room_views(seed: int, width: int, height: int, num_train: int, num_test: int) -> list[View]:
+    """Make three passes along an arc in front of the table.
+
+    Every fourth test view lies beyond the ends of the arc, and shows parts that photos hardly show.
+    """
+    generator = np.random.default_rng([seed, 2])
+    turn = Shell.of(seed).turn
+    total, tests = num_train + num_test, held_out(num_train, num_test)
+    beyond = tests[2::4]
+    views = []
+    for i in range(total):
+        progress = i * len(ELEVATIONS) / total
+        level = int(progress)
+        along = (2.0 * (progress - level) - 1.0) * (-1.0) ** level * ARC  # Every second pass goes back.
+        spread = generator.uniform(-1.0, 1.0, 7)
+        if i in beyond:
+            along = np.copysign(ARC + 0.25 + 0.12 * spread[0], along)
+        azimuth = along + 0.05 * spread[0] - 0.5 * np.pi
+        elevation = ELEVATIONS[level] + 0.06 * spread[1]
+        target = TARGET + 0.12 * spread[2:5] * [1.0, 1.0, 0.5]
+        place = target + 2.15 * (1.0 + 0.08 * spread[5]) * direction(azimuth, elevation)
+        pose = look_at(turn @ place, turn @ target, 0.04 * spread[6])
+        views.append(make_view(i, i in tests, pose, 0.98, width, height))
+    return views
 
 
 def _fixtures(shell: Shell, generator: np.random.Generator, noise: Noise, hue: float) -> tuple[Thing[Mesh], ...]:

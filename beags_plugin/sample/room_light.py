@@ -1,4 +1,4 @@
-"""Light of a room: a bright panel in the ceiling with soft shadows, and what the walls throw back."""
+"""Light of a room: a bright panel in the ceiling with soft shadows, and light reflected by the walls."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from beags_plugin.sample.meshes import block, moved, raycaster, rays
 from beags_plugin.sample.room import SHELL, Room
 from beags_plugin.sample.solids import dot, turned
 
-LIFT = 1e-3  # world units off the surface, so that shadow rays do not hit where they start
-PANEL = np.array([1.1, 0.7])  # half its sides
+LIFT = 1e-3  # distance from the surface at which shadow rays start, so that they do not hit it; world units
+PANEL = np.array([1.1, 0.7])  # half the sides of the panel
 LAMP, BOUNCE = np.array([9.5, 9.1, 8.4]), np.array([0.40, 0.39, 0.41])
-REACH = 0.8  # world units within which surfaces keep thrown-back light from one another
+REACH = 0.8  # distance within which surfaces block reflected light from one another, world units
 SHARES = 4
-"""Each ray of a pixel looks at its own share of the lamp and of the ways around, all together at everything."""
+"""Each ray of a pixel samples one of so many shares of the lamp and of the directions; together they sample all."""
 
 
 def _spiral(count: int) -> np.ndarray:
@@ -45,7 +45,7 @@ class RoomLight:
         return ~self._blockers.test_occlusions(rays(points, ways), 0.0, end).numpy()
 
     def _light(self, points: np.ndarray, normals: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """Return [N, 3] light at surface points [N, 3] with normals [N, 3], by the lamps and ways of each's share."""
+        """Return [N, 3] light at surface points [N, 3] with normals [N, 3], from the samples of each one's share."""
         lifted = points + LIFT * normals
         direct, bounced = np.zeros(len(points)), np.zeros(len(points))
         members = [np.flatnonzero(share == i) for i in range(SHARES)]
@@ -56,7 +56,7 @@ class RoomLight:
             facing = np.maximum(dot(way, normals[on]), 0.0) * np.maximum(way[:, 2], 0.0) / squared**2
             lit = np.flatnonzero(facing > 0.0)
             direct[on[lit]] += facing[lit] * self._open(lifted[on[lit]], way[lit], 1.0)
-        for i, way in enumerate(self._ways):  # about the normal their density is proportional to the cosine
+        for i, way in enumerate(self._ways):  # normal + way has a density proportional to the cosine.
             on = members[i % SHARES]
             bounced[on] += self._open(lifted[on], normals[on] + 0.999 * way, REACH)
         direct *= SHARES / len(self._lamp)
@@ -66,14 +66,13 @@ class RoomLight:
     def colours(
         self, points: np.ndarray, surface: np.ndarray, directions: np.ndarray, center: np.ndarray
     ) -> np.ndarray:
-        """See ``scene.Lighting``."""
         albedo, normals = np.empty_like(points), np.empty_like(points)
         for which in np.unique(surface):
             on = np.flatnonzero(surface == which)
             if which == SHELL:
                 albedo[on], normals[on] = self._shell(points[on])
             else:
-                thing = self.room.things[which - 1] if which > 0 else self.room.fixtures[-1 - which]
+                thing = self.room.part(which)
                 local, way = thing.to_local(points[on]), turned(directions[on], thing.rotation)
                 albedo[on] = thing.texture(local)
                 normals[on] = turned(thing.solid.normals(local, way), thing.rotation.T)
@@ -90,7 +89,7 @@ class RoomLight:
         return self._paper(local), turned(normals, shell.turn.T)
 
     def _paper(self, local: np.ndarray) -> np.ndarray:
-        """Return the shell's albedo at points [N, 3] in its frame; the panel is so bright that it needs no light."""
+        """Return the shell's albedo at points [N, 3] in its frame; that of the panel is 10, so that it is white."""
         shell = self.room.shell
         ceiling = (np.argmax(np.abs(local) / shell.half, axis=1) == 2) & (local[:, 2] > 0.0)
         panel = ceiling & (np.abs(local[:, :2] + shell.middle[:2]) < PANEL).all(axis=1)

@@ -1,4 +1,4 @@
-"""The objects of a room, in groups that touch: each is placed so that the contacts are exact."""
+"""The objects of a room, in groups that touch exactly."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from beags_plugin.sample.textures import Noise, linear_from_hsv
 
 @dataclass
 class Group:
-    """Things that touch, about (0, 0, 0) on the table, and where: names of both ("table"), and the point."""
+    """Things that touch, around (0, 0, 0) on the table, and their contacts: both names ("table" too) and the point."""
 
     things: list[Thing[Mesh]] = field(default_factory=list)
     contacts: list[tuple[str, str, tuple[float, float, float]]] = field(default_factory=list)
@@ -29,7 +29,7 @@ class Group:
         self.things.append(Thing(name, mesh, turn, np.array(position), texture))
 
     def touch(self, first: str, second: str, x: float, y: float, z: float) -> None:
-        """Note a contact."""
+        """Add a contact."""
         self.contacts.append((first, second, (x, y, z)))
 
 
@@ -43,7 +43,7 @@ def superellipse(x: float, y: float, power: float, count: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Stock:
-    """What things are made with: random sizes, colours within ``spread`` turns of one hue, and the noise of prints."""
+    """Random sizes, colours within ``spread`` turns of one hue, and the noise of prints, to make things with."""
 
     generator: np.random.Generator
     noise: Noise
@@ -51,25 +51,25 @@ class Stock:
     spread: float = 0.2
 
     def about(self, value: float) -> float:
-        """Return a size that differs by up to 8 %."""
+        """Return a size that differs from ``value`` by up to 8 %."""
         return float(value * self.generator.uniform(0.92, 1.08))
 
     def colours(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return a light and a dark colour, linear RGB; colour alone does not tell the objects apart."""
+        """Return a light and a dark colour, linear RGB, alike enough that colour alone does not separate objects."""
         tint = self.hue + self.generator.uniform(-self.spread, self.spread)
         return linear_from_hsv(tint, self.generator.uniform(0.3, 0.6), 0.9), linear_from_hsv(tint + 0.08, 0.7, 0.36)
 
 
 def make_groups(stock: Stock) -> list[Group]:
-    """Make the groups."""
+    """Make all groups."""
     return [make(stock) for make in (_crate, _mug, _basket, _vase, _frame)]
 
 
 def _crate(stock: Stock) -> Group:
-    """A book leans on a crate, on which a star lies."""
+    """Make a crate, a book that leans on it, and a star that lies on it."""
     group, about, colours, noise = Group(), stock.about, stock.colours, stock.noise
     x, y, top = about(0.20), about(0.15), about(0.30)
-    west = -0.10  # middle of the crate, so that the group is about its middle
+    west = -0.10  # x of the crate, so that the group surrounds its origin
     planks = prints.wood(noise, *colours(), plank=0.1)
     label = prints.within(planks, (0.0, 0.0, 0.2, 0.12, prints.lettering(noise, *colours(), size=0.024)))
     half = (x, y, 0.5 * top)
@@ -78,7 +78,7 @@ def _crate(stock: Stock) -> Group:
     group.touch("crate", "table", west, 0.0, 0.0)
     foot, edge = np.array([west + x + about(0.13), 0.0]), np.array([west + x, top])
     lean = (edge - foot) / np.linalg.norm(edge - foot)
-    across = np.array([lean[1], -lean[0]])  # away from the crate
+    across = np.array([lean[1], -lean[0]])  # normal of the book, away from the crate
     thick, wide, long = about(0.022), about(0.13), about(0.205)
     middle = foot + thick * across + long * lean
     rotation = np.array([[across[0], 0.0, lean[0]], [0.0, 1.0, 0.0], [across[1], 0.0, lean[1]]])
@@ -100,7 +100,7 @@ def _crate(stock: Stock) -> Group:
 
 
 def _mug(stock: Stock) -> Group:
-    """A spoon leans in a mug with a thin handle."""
+    """Make a mug with a thin handle, and a spoon that leans in it."""
     group, about, colours, noise = Group(), stock.about, stock.colours, stock.noise
     outside, high = about(0.135), about(0.24)
     inside, floor = outside - 0.022, 0.025
@@ -113,12 +113,12 @@ def _mug(stock: Stock) -> Group:
     group.place("mug", Mesh(wall, sweep(bow, 0.016)), prints.around(print_, outside))
     group.touch("mug", "table", 0.0, 0.0, 0.0)
 
-    # In the plane y = 0: the round end on the mug's floor, the shaft on the inner edge of the rim.
+    # In the plane y = 0, the spoon's round end lies on the mug's floor, and its shaft on the inner edge of the rim.
     shaft = 0.014
     start, rim = np.array([-0.55 * inside, floor + shaft]), np.array([inside, high])
     reach = float(np.linalg.norm(rim - start))
     tilt = float(np.arctan2(rim[1] - start[1], rim[0] - start[0]) + np.arcsin(shaft / reach))
-    lowest = 0.5 * np.pi - tilt  # of the end's profile, from its pole, where a vertex must lie
+    lowest = 0.5 * np.pi - tilt  # angle from the pole of the end's lowest point, where a vertex must lie
     polar = np.concatenate([np.linspace(0.0, lowest, 4)[:-1], np.linspace(lowest, 0.5 * np.pi, 5)])
     length, bowl = about(0.42), 0.045
     end = np.stack([shaft * np.sin(polar), -shaft * np.cos(polar)], axis=1)
@@ -129,7 +129,7 @@ def _mug(stock: Stock) -> Group:
     profile = np.concatenate([end, head])
     flat = np.concatenate([np.ones(len(end)), np.linspace(1.0, 0.3, 6), np.full(10, 0.3)])
     rotation = np.array([[np.sin(tilt), 0.0, np.cos(tilt)], [0.0, 1.0, 0.0], [-np.cos(tilt), 0.0, np.sin(tilt)]])
-    turn = turn_z(0.75 * np.pi)  # from the handle; vertices of the turned mug lie there too
+    turn = turn_z(0.75 * np.pi)  # angle from the handle, at which the mug has vertices
     grain = prints.wood(noise, *colours(), plank=0.05)
     tip = turn @ np.array([start[0], 0.0, start[1]])
     group.place("spoon", Mesh(lathe(profile, flat)), lambda p: grain(p[:, 2], p[:, 0]), tuple(tip), turn @ rotation)
@@ -139,7 +139,7 @@ def _mug(stock: Stock) -> Group:
 
 
 def _basket(stock: Stock) -> Group:
-    """A ball lies in a basket with a hoop."""
+    """Make a basket with a hoop, and a ball that lies in it."""
     group, about, colours, noise = Group(), stock.about, stock.colours, stock.noise
     base, brim, high, thick = about(0.15), about(0.24), about(0.17), 0.026
     profile = [(0, 0), (base, 0), (brim, 0.7 * high), (brim, high), (brim - thick, high), (brim - thick, 0.7 * high),
@@ -163,7 +163,7 @@ def _basket(stock: Stock) -> Group:
 
 
 def _vase(stock: Stock) -> Group:
-    """A vase with a narrow neck, open at the top."""
+    """Make a vase with a narrow neck, open at the top."""
     group, about, colours, noise = Group(), stock.about, stock.colours, stock.noise
     wide, high = about(0.14), about(0.46)
     up = np.linspace(0.0, 1.0, 40)
@@ -178,7 +178,7 @@ def _vase(stock: Stock) -> Group:
 
 
 def _frame(stock: Stock) -> Group:
-    """A standing frame with rounded corners, which one can see through."""
+    """Make a standing frame with rounded corners and a hole."""
     group, about, colours, noise = Group(), stock.about, stock.colours, stock.noise
     wide, high, deep = about(0.22), about(0.2), about(0.055)
     outer = superellipse(wide, high, 3.5, 48)

@@ -1,4 +1,4 @@
-"""What a generated scene is made of: objects, where they touch, and what surrounds them."""
+"""Parts of a generated scene: objects, their contacts, and the background around them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Thing(Generic[Shape]):
 
 @dataclass(frozen=True)
 class Contact:
-    """A world point [3] on the surfaces of both objects; 0 is what they stand on, i the object of class id i."""
+    """A world point [3] on the surfaces of both objects; i is the object of class id i, 0 the table or ground."""
 
     first: int
     second: int
@@ -69,7 +69,7 @@ class Scene(ABC):
 
 
 class Lighting(Protocol):
-    """The light of a scene; it makes surfaces look the same from every view, but for a turntable's background."""
+    """The light of a scene; surfaces look the same from every view, except the background of a turntable."""
 
     def colours(
         self, points: np.ndarray, surface: np.ndarray, directions: np.ndarray, center: np.ndarray
@@ -83,8 +83,8 @@ class Lighting(Protocol):
 
 @runtime_checkable
 class DirectLighting(Protocol):
-    """A light that casts the rays of a photo itself, since it knows where on its surfaces they end."""
+    """A light that casts the rays of a photo itself, with hits that it can look up directly."""
 
     def seen(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return what ``Lighting.colours`` gives, for rays from ``origin`` [3] along ``directions`` [N, 3]."""
+        """Return ``Lighting.colours`` of the first hits of rays from ``origin`` [3] along ``directions`` [N, 3]."""
         ...

@@ -1,7 +1,7 @@
-"""The part of an object's silhouette that rests on surface which the training photos show.
+"""Find the part of an object's silhouette whose surface the training photos show.
 
-Where objects touch, photos show their surfaces nowhere or only through a gap. An evaluation may leave such pixels of
-the silhouette out. Likewise what an object hid can only be put back where some photo shows it.
+Where objects touch, photos show their surfaces nowhere, or only through a gap. An evaluation may leave such pixels of
+the silhouette out. Likewise, the surface behind an object can only be restored where some photo shows it.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from beags_plugin.sample.scene import Scene
 from beags_plugin.sample.tracing import first_hits
 from beags_plugin.sample.views import Picture, View, pixel_directions
 
-MIN_VIEWS = 6  # photos that must show a patch of surface; fewer, through a gap and at a slant, do not place it in space
+MIN_VIEWS = 6  # photos that must show a patch of surface; fewer, through a gap, do not determine its position
 PATCH = 0.03  # side of a patch, world units: a few pixels, so that every photo that shows one has points in it
-GAP = 1  # pixels: points of neighbouring pixels of one photo lie at most so far apart in another, seen at like distance
+GAP = 1  # pixels by which points of neighbouring pixels of one photo may lie apart in another at a like distance
 
-NEAR = 0.05  # share of a point's depth by which that of its pixel in a photo may differ where it is not hidden
-SAME = 1e-6  # share of the distance to a point by which rounding lets a ray end before it
+NEAR = 0.05  # relative difference of the depths of a point and of its pixel below which it may be visible
+SAME = 1e-6  # relative rounding error of the distance at which a ray ends
 
 
 def surface_points(view: View, depth: np.ndarray) -> np.ndarray:
@@ -37,7 +37,7 @@ def visible_surface(view: View, picture: Picture) -> list[np.ndarray]:
 
 
 def well_seen(parts: list[np.ndarray], min_views: int = MIN_VIEWS) -> np.ndarray:
-    """Return points [P, 3] of ``parts`` ([P_i, 3], one per photo) whose patch at least ``min_views`` photos show."""
+    """Return the points [P, 3] of ``parts`` ([P_i, 3], one per photo) whose patch ``min_views`` photos or more show."""
     points = np.concatenate(parts)
     photo = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     cells = np.floor(points / PATCH).astype(np.int64)
@@ -49,21 +49,21 @@ def well_seen(parts: list[np.ndarray], min_views: int = MIN_VIEWS) -> np.ndarray
 
 
 def seen_part(view: View, surface: np.ndarray, silhouette: np.ndarray) -> np.ndarray:
-    """Return [H, W] bool, the pixels of ``silhouette`` whose ray meets the object's seen surface, near or far.
+    """Return [H, W] bool, the pixels of ``silhouette`` whose ray meets surface that photos show, hidden or not.
 
-    surface: [P, 3] world points of the object, as ``well_seen`` gives them. silhouette: [H, W] bool.
+    surface: [P, 3] world points of the object, from ``well_seen``. silhouette: [H, W] bool.
     """
     _, rows, columns, _ = _landing(view, surface)
     hit = np.zeros(silhouette.shape, dtype=bool)
     hit[rows, columns] = True
-    # Points of neighbouring pixels of one photo lie up to a pixel apart in another: closing fills the gaps between
-    # them and leaves the boundary where it is.
+    # Points of neighbouring pixels of one photo lie up to a pixel apart in another: closing fills these gaps and does
+    # not move the boundary.
     return ndimage.binary_closing(np.pad(hit, GAP), np.ones((3, 3)), GAP)[GAP:-GAP, GAP:-GAP] & silhouette
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo of training: its camera, what stood before it, and its depth [H, W]."""
+    """A training photo: its camera, its scene, and its depth [H, W]."""
 
     view: View
     scene: Scene
@@ -72,34 +72,34 @@ class Photo:
 
 def shown_in(photo: Photo, points: np.ndarray) -> np.ndarray:
     """Return [P] bool: which world points [P, 3] of the scene's surfaces a photo shows."""
-    shown = np.zeros(len(points), dtype=bool)
+    visible = np.zeros(len(points), dtype=bool)
     inside = _landing(photo.view, points)[0]
-    shown[inside] = _reached(photo, points[inside])
-    return shown
+    visible[inside] = _reached(photo, points[inside])
+    return visible
 
 
 def shown_points(points: np.ndarray, photos: Sequence[Photo]) -> np.ndarray:
     """Return [P] bool: which world points [P, 3] of the scene's surfaces some photo shows.
 
-    Depth tells for most points that they are hidden; rays are cast at the others.
+    The depth rules out most hidden points; rays are cast at the others.
     """
-    shown = np.zeros(len(points), dtype=bool)
+    visible = np.zeros(len(points), dtype=bool)
     for photo in photos:
-        rest = np.flatnonzero(~shown)
+        rest = np.flatnonzero(~visible)
         inside, rows, columns, depth = _landing(photo.view, points[rest])
         near = rest[inside[np.abs(depth - photo.depth[rows, columns]) <= NEAR * depth]]
-        shown[near] = _reached(photo, points[near])
-    return shown
+        visible[near] = _reached(photo, points[near])
+    return visible
 
 
 def _reached(photo: Photo, points: np.ndarray) -> np.ndarray:
-    """Return [P] bool: which world points [P, 3] on surfaces nothing hides from the photo's camera."""
+    """Return [P] bool: which world points [P, 3] on surfaces are not hidden from the photo's camera."""
     hits, _ = first_hits(photo.scene, photo.view.center, points - photo.view.center)
     return hits.t > 1.0 - SAME
 
 
 def _landing(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return which of ``points`` [P, 3] lie inside the picture, [M], and of these row, column and depth."""
+    """Return the indices [M] of the ``points`` [P, 3] inside the picture, and their rows, columns and depths."""
     local = (points - view.center) @ view.camera_to_world[:3, :3]
     front = np.flatnonzero(local[:, 2] < 0)
     depth = -local[front, 2]

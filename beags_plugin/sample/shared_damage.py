@@ -1,6 +1,6 @@
-"""Mask damage that most views share, as segmenters make it: a plinth taken in, a foot left out.
+"""Mask errors that most views share, as segmenters make them: a plinth is included, or a foot is left out.
 
-Each flaw is a region of space that stands with its object, so that views agree on it. Seed and names decide everything.
+Each flaw is a region of space, so that views agree on it. Seed and names decide everything.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from beags_plugin.sample.solids import dot, turned
 from beags_plugin.sample.views import View
 
 CHORDS = 4096  # rays that sample the surface of an object
-FOOT = 0.15  # share of an object's height that its foot has
+FOOT = 0.15  # height of an object's foot over the object's height
 TAKEN_IN = 0.25, 0.40
-"""How far what is taken in reaches beyond the foot: a share of half of the object's width or height, the larger one."""
+"""Range of the included region's reach beyond the foot, over half of the object's width or height, if larger."""
 LEFT_OUT = 0.06, 0.14
-"""Share of an object's surface that is left out."""
+"""Range of the share of an object's surface that is left out."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Beyond:
 
 @dataclass(frozen=True)
 class Flaw:
-    """What masks of ``views`` have wrong: surface of the classes ``wrong`` in the region has the id ``instead``."""
+    """An error in the masks of ``views``: surface of the classes ``wrong`` in the region has the id ``instead``."""
 
     wrong: frozenset[int]
     instead: int
@@ -61,10 +61,10 @@ class Flaw:
 
 
 def plan_flaws(scene: Scene, train: Sequence[str], seed: int, share: float) -> list[Flaw]:
-    """Return a flaw of half of the objects, each in the masks of a ``share`` of the training views, if it is above 0.
+    """Return a flaw of half of the objects, each in the masks of a ``share`` of the training views.
 
-    The first object, and every second, takes in what it stands on, about its foot; the others lose what lies lowest on
-    one side to the background. Each flaw has views of its own.
+    The masks of every second object, from the first on, include the surface below it around its foot; those of the
+    others lack the lowest part on one side. Each flaw has views of its own.
     """
     count = round(share * len(train))
     if not count:
@@ -78,8 +78,10 @@ def plan_flaws(scene: Scene, train: Sequence[str], seed: int, share: float) -> l
         views = lowest_lots(train, seed, count, 14 + class_id)
         if i % 2 == 0:
             below = {contact.second for contact in scene.contacts if contact.first == class_id}
-            foot = Near(*_grown_foot(surface, generator.uniform(*TAKEN_IN)))
-            flaws.append(Flaw(frozenset(below | {0}), class_id, foot, views))
+            extent = np.ptp(surface, axis=0)
+            foot = surface[surface[:, 2] <= surface[:, 2].min() + FOOT * extent[2]]
+            near = Near(foot, float(0.5 * generator.uniform(*TAKEN_IN) * extent.max()))
+            flaws.append(Flaw(frozenset(below | {0}), class_id, near, views))
         else:
             way = np.array([np.cos(angle), np.sin(angle), -1.0]) / np.sqrt(2.0)
             limit = np.quantile(dot(surface, way[None]), 1.0 - generator.uniform(*LEFT_OUT))
@@ -88,7 +90,7 @@ def plan_flaws(scene: Scene, train: Sequence[str], seed: int, share: float) -> l
 
 
 def flawed_mask(labels: np.ndarray, depth: np.ndarray, view: View, flaws: Sequence[Flaw]) -> np.ndarray:
-    """Return ``labels`` [H, W] with the flaws that the view has; depth: [H, W], exact, along the optical axis."""
+    """Return ``labels`` [H, W] with the view's flaws; depth: [H, W], exact, along the optical axis."""
     out = labels.copy()
     for flaw in flaws:
         if view.name in flaw.views:
@@ -97,19 +99,13 @@ def flawed_mask(labels: np.ndarray, depth: np.ndarray, view: View, flaws: Sequen
     return out
 
 
-def _grown_foot(surface: np.ndarray, beyond: float) -> tuple[np.ndarray, float]:
-    """Return the points of a surface [P, 3] that are its foot, and the radius that is ``beyond`` of half its size."""
-    extent = np.ptp(surface, axis=0)
-    return surface[surface[:, 2] <= surface[:, 2].min() + FOOT * extent[2]], float(0.5 * beyond * extent.max())
-
-
 def _surface(thing: Thing[Any]) -> np.ndarray:
-    """Return world points [P, 3] on the outside of an object, where rays from above and from the sides meet it."""
+    """Return world points [P, 3] of an object's surface, where rays from above and from the sides meet it."""
     generator = np.random.default_rng(0)
     start, end = generator.normal(size=(2, CHORDS, 3))
     start, end = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True) for vectors in (start, end))
     start[:, 2] = np.abs(start[:, 2])
-    # Rays begin on the upper half of a sphere about the object, and pass through the ball that holds it.
+    # Rays begin on the upper half of a sphere around the object, and pass through its bounding ball.
     start, end = 2.0 * start, end * generator.uniform(size=(CHORDS, 1)) ** (1.0 / 3.0)
     origins, directions = (turned(thing.solid.bound * vectors, thing.rotation) for vectors in (start, end - start))
     t = thing.solid.first_hit(origins, directions)

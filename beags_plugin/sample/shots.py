@@ -1,4 +1,4 @@
-"""What differs between the photos of one scene: a thing that moved, exposure and white balance."""
+"""Differences between the photos of one scene: a thing that moved, exposure and white balance."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from beags_plugin.sample.tracing import first_hits
 from beags_plugin.sample.views import Picture, View, pixel_directions, render_view
 from beags_plugin.sample.visitors import with_visitor
 
-AHEAD = 2  # pictures that are rendered beside each other, each by a thread
+AHEAD = 2  # pictures that are rendered at the same time, each by a thread
 
 
 @dataclass(frozen=True)
 class Shot:
     """One photo to take.
 
-    still: the scene that all photos show. scene: the same with the visitor, where there is one in this photo. light:
-    of ``scene``, at the mean exposure. exposed: as this photo records it, or ``light`` itself where that is the same.
+    still: the scene that all photos show. scene: the same with the visitor, if this photo has one. light: the light of
+    ``scene``, at the mean exposure. exposed: the light as this photo records it, or ``light`` itself if it is the same.
     """
 
     view: View
@@ -35,7 +35,7 @@ class Shot:
     exposed: Lighting
 
     def lasting(self, picture: Picture) -> np.ndarray:
-        """Return [H, W] bool: pixels of ``picture`` whose surface all photos could show, which a visitor's is not."""
+        """Return [H, W] bool: the pixels of ``picture`` that do not show the visitor."""
         if self.scene is self.still:
             return np.ones(picture.labels.shape, dtype=bool)
         hits, _ = first_hits(self.still, self.view.center, pixel_directions(self.view))
@@ -45,9 +45,9 @@ class Shot:
 def plan_shots(
     family: Family, seed: int, views: list[View], exposure: float, white_balance: float, moved: int
 ) -> list[Shot]:
-    """Return a shot for each view; exposure, white_balance: see ``photo_gains``. moved: training photos with a visitor.
+    """Return a shot for each view; the seed and the names of the training photos decide which have the visitor.
 
-    Seed and names of the training photos decide which of them have the visitor.
+    exposure, white_balance: see ``photo_gains``. moved: number of training photos with the visitor.
     """
     still = family.scene(seed)
     light = family.light(still)

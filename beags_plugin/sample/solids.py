@@ -1,8 +1,8 @@
-"""Solids for exact ray casting: intersections of convex primitives, less one such intersection.
+"""Solids for exact ray casting: an intersection of convex primitives minus another one.
 
-A ray meets a convex body in one interval, so the first hit of ``add \\ cut`` is found without any iteration.
-Everything is in the solid's own frame; lengths are world units, rays are ``origin + t direction`` with directions
-of any length (t scales with it).
+A ray meets a convex body in one interval, so the first hit of ``add \\ cut`` needs no iteration. Everything is in the
+solid's own frame; lengths are world units, rays are ``origin + t direction`` with directions of any length (t scales
+with it).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class Primitive(Protocol):
     """A convex body."""
 
     def interval(self, origins: np.ndarray, directions: np.ndarray) -> Interval:
-        """Return the part of each ray inside; origins [N, 3], directions [N, 3], either of which may be [1, 3]."""
+        """Return the part of each ray inside; origins and directions [N, 3], either of which may be [1, 3]."""
         ...
 
     def distance(self, points: np.ndarray) -> np.ndarray:
@@ -35,7 +35,7 @@ class Primitive(Protocol):
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return [N] row-wise products of [N, k] and [N, k], either of which may be [1, k].
 
-    Determinism: written out, since a BLAS product may differ in its last bit with the number of threads.
+    Determinism: the last bit of a BLAS product may depend on the number of threads.
     """
     total = a[:, 0] * b[:, 0]
     for i in range(1, a.shape[1]):
@@ -133,7 +133,7 @@ class Cone:
 
     def interval(self, origins: np.ndarray, directions: np.ndarray) -> Interval:
         slope = self.radius / self.height
-        # x^2 + y^2 - slope^2 (z - height)^2 <= 0 is a double cone: the nappe below the apex is picked at the end.
+        # x^2 + y^2 - slope^2 (z - height)^2 <= 0 is a double cone: the nappe below the apex is chosen at the end.
         stretch = np.array([1.0, 1.0, -(slope**2)])
         o = origins - np.array([0.0, 0.0, self.height])
         a = dot(directions**2, stretch[None])
@@ -144,7 +144,8 @@ class Cone:
             one, two = (-half_b - root) / a, (-half_b + root) / a
         near, far = np.minimum(one, two), np.maximum(one, two)
         miss = (half_b * half_b - a * c <= 0.0) | (a == 0.0)
-        # A ray steeper than the cone (a < 0) is inside outside the roots: below the apex it is one half-line.
+        # A ray steeper than the cone (a < 0) is inside where t is not between the roots: below the apex, on one half
+        # line.
         steep, down = a < 0.0, directions[:, 2] < 0.0
         start = np.where(steep, np.where(down, far, -np.inf), near)
         stop = np.where(steep, np.where(down, np.inf, near), far)
@@ -158,7 +159,7 @@ class Cone:
         return (self.height * across + self.radius * (points[:, 2] - self.height)) / np.hypot(self.radius, self.height)
 
     def normal(self, points: np.ndarray) -> np.ndarray:
-        # On the axis (only the apex is a surface point there) any horizontal part serves; 1e-12 avoids 0 / 0.
+        # At the apex, the only surface point on the axis, any horizontal direction will do; 1e-12 avoids 0 / 0.
         across = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-12)
         up = np.full_like(across, self.radius)
         normals = np.stack([self.height * points[:, 0] / across, self.height * points[:, 1] / across, up], axis=1)
@@ -180,9 +181,9 @@ def _meet(primitives: tuple[Primitive, ...], origins: np.ndarray, directions: np
 
 @dataclass(frozen=True)
 class Solid:
-    """The common part of ``add`` less the common part of ``cut`` (none if empty).
+    """The intersection of ``add`` minus the intersection of ``cut`` (nothing if empty).
 
-    bound: radius of a ball about the frame's origin that holds all of it.
+    bound: radius of a ball about the frame's origin that contains the solid.
     """
 
     add: tuple[Primitive, ...]
@@ -196,12 +197,12 @@ class Solid:
         if not self.cut:
             return near
         cut_near, cut_far = _meet(self.cut, origins, directions)
-        # The ray enters where the cut has taken the material away: the hit is where it leaves the cut, if still in add.
+        # Where the ray enters ``add`` inside the cut, the hit is where it leaves the cut, if it is still in ``add``.
         hollow = (cut_near <= near) & (near < cut_far)
         return np.where(hollow, np.where(cut_far < far, cut_far, np.inf), near)
 
     def occludes(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return [N] bool, whether material lies at t > 0; origins may be anywhere outside, also in the hollow."""
+        """Return [N] bool, whether the solid lies at t > 0; origins may be anywhere outside it, also in the hollow."""
         near, far = _meet(self.add, origins, directions)
         near = np.maximum(near, 0.0)
         if not self.cut:
@@ -211,14 +212,14 @@ class Solid:
         return (near < far) & (cut_empty | (near < cut_near) | (cut_far < far))
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return [N] a lower bound of the signed distance: its sign and zeros are exact; points [N, 3]."""
+        """Return [N] a lower bound of the signed distance, whose sign and zeros are exact; points [N, 3]."""
         value = np.max([p.distance(points) for p in self.add], axis=0)
         if self.cut:
             value = np.maximum(value, -np.max([p.distance(points) for p in self.cut], axis=0))
         return value
 
     def normals(self, points: np.ndarray) -> np.ndarray:
-        """Return [N, 3] outward unit normals at surface points [N, 3], of the primitive with the nearest surface."""
+        """Return [N, 3] outward unit normals at surface points [N, 3]: those of the primitive of nearest surface."""
         parts = [(p, 1.0) for p in self.add] + [(p, -1.0) for p in self.cut]
         nearest = np.argmin([np.abs(p.distance(points)) for p, _ in parts], axis=0)
         normals = np.zeros_like(points)

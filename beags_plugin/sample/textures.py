@@ -1,8 +1,8 @@
-"""Solid textures of medium frequency: lattice noise and the patterns made of it.
+"""Solid textures of medium frequency: lattice noise and patterns made from it.
 
 A pattern maps points [N, 3] (in an object's own frame, world units) to a blend weight [N] in 0..1; a texture blends
-its colours (linear RGB) by it and mottles the result. Nothing is finer than about 0.05 units, so that small images do
-not alias.
+its colours (linear RGB) by it and mottles the result. No detail is finer than about 0.05 units, so that small images
+do not alias.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def marble(noise: Noise, per_unit: float) -> Pattern:
 
 @dataclass(frozen=True)
 class Texture:
-    """Two colours blended by a pattern, and a mottle of a third.
+    """Two colours blended by a pattern, and spots of a third.
 
     light, dark, fleck: [3] linear RGB. The mottle changes brightness by up to ``contrast`` and adds the fleck colour.
     """

@@ -1,4 +1,4 @@
-"""Exact ray casting of a scene: first hits, and each object's own silhouette."""
+"""Exact ray casting of a scene: first hits, and the silhouette of each object."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class Hits:
 
 
 def object_hits(thing: Thing[Any], origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the rays that hit the object, were it alone, and where.
+    """Find the rays that would hit the object if it were alone.
 
     origin: [3] outside of all objects; directions: [N, 3]. Returns indices [M] and their t [M].
     """
     offset = origin - thing.position
-    # Only rays that cross the bounding ball; 1e-9 allows for the rounding of the bound itself.
+    # Only rays through the bounding ball are traced; 1e-9 covers the rounding of the bound itself.
     along, squared = dot(directions, offset[None]), offset @ offset - thing.solid.bound**2 * (1.0 + 1e-9)
     away = (along >= 0.0) & (squared > 0.0)
     near = np.flatnonzero(~away & (along * along >= squared * dot(directions, directions)))
@@ -46,7 +46,7 @@ def hit_fixtures(
     part: np.ndarray,
     first_part: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the background's ``t`` and ``part`` [N] with hits of its fixtures; fixture i is ``first_part`` - i."""
+    """Add hits of the background's fixtures to its ``t`` and ``part`` [N]; fixture i is part ``first_part`` - i."""
     for i, fixture in enumerate(fixtures):
         rays, distances = object_hits(fixture, origin, directions)
         first = distances < t[rays]
@@ -58,7 +58,7 @@ def hit_fixtures(
 def first_hits(
     scene: Scene, origin: np.ndarray, directions: np.ndarray, without: int | None = None
 ) -> tuple[Hits, list[np.ndarray]]:
-    """Find first hits of rays from one point, and for each object the rays that would hit it alone.
+    """Find the first hits of rays from one point, and for each object the rays that would hit it if it were alone.
 
     origin: [3], world, inside the background and outside of all objects; directions: [N, 3], any length. without: class
     id of an object that lets all rays pass.
@@ -75,7 +75,7 @@ def first_hits(
 
 
 def seen_share(things: Sequence[Thing[Solid]], origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return the fraction [N] of unit ``directions`` [K, 3] that no object blocks, from ``origins`` [N, 3] outside."""
+    """Return the share [N] of unit ``directions`` [K, 3] that no object blocks, from ``origins`` [N, 3] outside."""
     blocked = np.zeros((len(directions), len(origins)), dtype=bool)
     for thing in things:
         offset = origins - thing.position

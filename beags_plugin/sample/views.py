@@ -1,4 +1,4 @@
-"""The sample's cameras, and what each of them sees."""
+"""The sample's cameras, and the pictures that they take."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from beags_plugin.sample.solids import turned
 from beags_plugin.sample.tracing import CHUNK, first_hits, object_hits
 
 ELEVATIONS = (0.34, 0.66, 1.02)
-"""Radians above the ground of the three rounds of cameras; their lens is 48 degrees wide."""
+"""Elevations of the three rounds of cameras above the ground, radians; their field of view is 48 degrees wide."""
 TARGET = np.array([0.0, 0.0, 0.26])
 
 
@@ -46,10 +46,10 @@ class View:
 
 @dataclass(frozen=True)
 class Picture:
-    """The images that a view sees.
+    """The images of a view.
 
     image: [H, W, 3] uint8 sRGB, antialiased by supersampling. The rest is exact at the pixel centres:
-    labels: [H, W] uint8 visible class ids. depth: [H, W] float32 z along the optical axis (there is always a hit).
+    labels: [H, W] uint8 visible class ids. depth: [H, W] float32 z along the optical axis (every ray hits something).
     silhouettes: [L, H, W] bool, object i + 1 as if it were alone.
     """
 
@@ -60,7 +60,7 @@ class Picture:
 
 
 def make_views(seed: int, width: int, height: int, num_train: int, num_test: int) -> list[View]:
-    """Make three jittered rounds about the scene at rising height, with test views spread evenly."""
+    """Make three jittered rounds around the scene at rising height, with test views spread evenly."""
     generator = np.random.default_rng([seed, 2])
     total = num_train + num_test
     tests = set(held_out(num_train, num_test))
@@ -71,15 +71,20 @@ def make_views(seed: int, width: int, height: int, num_train: int, num_test: int
         azimuth = start + 2.0 * np.pi * progress + generator.uniform(-0.05, 0.05)
         elevation = ELEVATIONS[int(progress)] + generator.uniform(-0.06, 0.06)
         radius = (2.3 + 0.12 * int(progress)) * generator.uniform(0.94, 1.06)
-        way = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
         target = TARGET + generator.uniform(-0.06, 0.06, 3)
-        pose = look_at(target + radius * way, target, generator.uniform(-0.04, 0.04))
+        place = target + radius * direction(azimuth, elevation)
+        pose = look_at(place, target, generator.uniform(-0.04, 0.04))
         views.append(make_view(i, i in tests, pose, 1.12, width, height))
     return views
 
 
+def direction(azimuth: float, elevation: float) -> np.ndarray:
+    """Return the unit vector [3] at an azimuth from x and an elevation above z = 0, radians."""
+    return np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+
+
 def held_out(num_train: int, num_test: int) -> list[int]:
-    """Return which of all views are test views: spread evenly."""
+    """Return the indices of the test views, spread evenly over all views."""
     return [int((i + 0.5) * (num_train + num_test) / num_test) for i in range(num_test)]
 
 
@@ -90,7 +95,7 @@ def make_view(index: int, test: bool, pose: np.ndarray, lens: float, width: int,
         split="test" if test else "train",
         camera_to_world=pose,
         focal=lens * width,
-        cx=0.5 * width + 0.015 * width,  # the axis is a little off the middle of the image
+        cx=0.5 * width + 0.015 * width,  # The axis is slightly off the middle of the image.
         cy=0.5 * height - 0.011 * height,
         width=width,
         height=height,
@@ -112,7 +117,7 @@ def look_at(position: np.ndarray, target: np.ndarray, roll: float) -> np.ndarray
 
 
 def _grid(view: View, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return image points [H W samples^2]: per pixel, row by row, the centres of samples x samples equal squares."""
+    """Return image points x, y [H W samples^2]: per pixel, row by row, the centres of samples x samples squares."""
     offset = (np.arange(samples) + 0.5) / samples
     x = (np.arange(view.width)[:, None] + offset).ravel()
     y = (np.arange(view.height)[:, None] + offset).ravel()
@@ -141,10 +146,10 @@ def render_pixels(scene: Scene, light: Lighting, view: View, pixels: np.ndarray,
 def render_removed(
     scene: Scene, light: Lighting, view: View, image: np.ndarray, class_id: int, samples: int
 ) -> np.ndarray | None:
-    """Render ``image``, that of ``render_image``, with an object cut out; None if the object does not show in it.
+    """Render ``image``, that of ``render_image``, with an object cut out; None if the object is not visible in it.
 
-    Light is as with the object: what stays keeps its shadows, as it does for an object cut out of photos. Pixels none
-    of whose rays meets the object first stay the same.
+    The light does not change: the object's shadows stay, as they do when an object is cut out of photos. Pixels whose
+    rays do not meet the object first stay the same.
     """
     directions, per_pixel = view.directions(*_grid(view, samples)), samples * samples
     rays, _ = object_hits(scene.things[class_id - 1], view.center, directions)
@@ -193,6 +198,6 @@ def render_view(scene: Scene, light: Lighting, view: View, samples: int = 2) -> 
     return Picture(
         image=render_image(scene, light, view, samples),
         labels=np.maximum(hits.surface, 0).astype(np.uint8).reshape(shape),
-        depth=hits.t.astype(np.float32).reshape(shape),  # directions have depth 1, so t is z
+        depth=hits.t.astype(np.float32).reshape(shape),  # Directions have depth 1, so t is z.
         silhouettes=masks.reshape(-1, *shape),
     )

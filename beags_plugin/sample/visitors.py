@@ -1,4 +1,4 @@
-"""A visitor: a thing of the background that stands in single photos of a capture, elsewhere in each of them."""
+"""A visitor: a thing of the background that stands in some photos of a capture, in another place in each."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from beags_plugin.sample.tracing import first_hits
 from beags_plugin.sample.views import View
 
 AROUND_STILL, AROUND_ROOM = (1.08, 1.28), (1.60, 1.66)
-"""World units from the z axis to the visitor: past all objects, and so near that its shadow stays in the light's map;
-past the table, before the cameras and the wall."""
+"""Ranges of the visitor's distance from the z axis, world units: beyond all objects, with its shadow in the light's
+map; beyond the table, before the cameras and the wall."""
 SHARES = (0.04, 0.14)
-"""Of a photo, covered by its visitor: the place that comes nearest to a share between these is taken."""
-PLACES = 24  # tried for each photo
-RAYS = 32, 24  # across and down, measure a share alike at every size of a photo
+"""Range of the share of a photo that its visitor should cover."""
+PLACES = 24  # positions that are tried for each photo
+RAYS = 32, 24  # rays across and down that measure the share, for photos of every size
 
 
 def with_visitor(scene: Scene, view: View, seed: int) -> Scene:
-    """Return a scene of ``families`` with the visitor in a place where ``view`` shows it; seed and name decide where.
+    """Return a scene of ``families`` with the visitor where ``view`` shows it; the seed and the view's name decide.
 
-    The visitor is a fixture, so that it is background in every mask, and casts shadows. It comes last of the fixtures.
+    The visitor is the last fixture: it is background in every mask, and casts shadows.
     """
     generator = view_generator(seed, view.name, 9)
     wanted = generator.uniform(*SHARES)
@@ -40,18 +40,18 @@ def with_visitor(scene: Scene, view: View, seed: int) -> Scene:
     x, y = ((np.arange(n) + 0.5) / n * size for n, size in zip(RAYS, (view.width, view.height), strict=True))
     directions = view.directions(*(grid.ravel() for grid in np.meshgrid(x, y)))
     empty = first_hits(scene, view.center, directions)[0].t
-    best, found = scene, np.inf
+    best, least = scene, np.inf
     for place in np.stack([distance * np.cos(angle), distance * np.sin(angle), np.zeros(PLACES)], axis=1):
-        there = tuple(replace(part, position=part.position + place) for part in visitor)
-        visited: Scene = replace(scene, fixtures=(*scene.fixtures, *there))  # type: ignore[attr-defined]
+        moved = tuple(replace(part, position=part.position + place) for part in visitor)
+        visited: Scene = replace(scene, fixtures=(*scene.fixtures, *moved))  # type: ignore[attr-defined]
         share = np.mean(first_hits(visited, view.center, directions)[0].t < empty)
-        if abs(share - wanted) < found:
-            best, found = visited, abs(share - wanted)
+        if abs(share - wanted) < least:
+            best, least = visited, abs(share - wanted)
     return best
 
 
 def _visitor(scene: Scene, seed: int) -> tuple[Thing[Any], ...]:
-    """Return the parts of the visitor, a body and a head, over the world's origin; the seed decides its colours."""
+    """Return the parts of the visitor, a body and a head, above the world's origin; the seed decides its colours."""
     generator = np.random.default_rng([seed, 10])
     noise, hue = Noise(generator), generator.uniform()
     shirt = [linear_from_hsv(hue, 0.75, 0.85), linear_from_hsv(hue + 0.4, 0.5, 0.35)]

@@ -26,10 +26,10 @@ from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.reading.ply import write_vertices
 
 VERSION = 12
-"""Raise it whenever the same config would give other files: older samples are then rebuilt."""
+"""Raise it whenever the same config gives other files: older samples are then rebuilt."""
 LARGEST_SIDE = 8192  # pixels
 POINT_NOISE = 0.03
-"""World units, two to three pixels at 256 x 192: as a hand-held capture gives."""
+"""Noise of seed points, world units: two to three pixels at 256 x 192, as in a hand-held capture."""
 SAMPLE_FILE, TRACKS_FILE = "sample.json", "seed_tracks.json"
 
 
@@ -37,19 +37,19 @@ SAMPLE_FILE, TRACKS_FILE = "sample.json", "seed_tracks.json"
 class SampleConfig:
     """Options that decide every byte of the sample.
 
-    family: of scenes: "tabletop" (solids on the ground, seen from all sides), "turntable" (the same views of the same
-        solids, which turn while ground and curtain stand), "room" (a closed room, see ``room``) or "desk" (textured
-        things that touch in such a room, see ``desk``).
-    seed: of arrangement, sizes, colours, textures, light, camera jitter, mask degradation.
-    width, height: pixels. num_train, num_test: views.
-    degradation: of the train masks: "none", "mild", "strong", a degree as text ("1.5"), or a ``Degradation``.
-    num_points: seed points. antialias: rays per pixel and direction for the images.
+    family: family of scenes: "tabletop" (solids on the ground, seen from all sides), "turntable" (the same views of the
+        same solids, which turn while ground and curtain stand still), "room" (a closed room, see ``room``) or "desk"
+        (textured things that touch in such a room, see ``desk``).
+    seed: decides arrangement, sizes, colours, textures, light, camera jitter, mask degradation.
+    width, height: pixels. num_train, num_test: numbers of views.
+    degradation: errors of the train masks: "none", "mild", "strong", a degree as text ("1.5"), or a ``Degradation``.
+    num_points: seed points. antialias: rays per pixel, along each axis, for the images.
     exposure, white_balance: stops, the largest differences of a photo from the mean (``exposure.photo_gains``); with 0
-        for both all photos are alike.
-    moved: training photos in which something of the background stands before the camera, elsewhere in each; no other
-        photo shows it.
-    shared_damage: share of the training masks in which each of half of the objects takes in what it stands on, or lacks
-        its foot on one side, alike in all of them (``plan_flaws``); ``degradation`` comes after it.
+        for both, all photos are alike.
+    moved: number of training photos in which something of the background stands before the camera, in another place in
+        each; no other photo shows it.
+    shared_damage: share of the training masks in which half of the objects have the same error each: the mask includes
+        the surface below the object, or lacks its foot on one side (``plan_flaws``); ``degradation`` is applied after.
     """
 
     seed: int = 0
@@ -92,15 +92,15 @@ class SampleConfig:
         resolve_degradation(self.degradation)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the content of sample.json; presets are written out, so that a changed preset is another sample."""
+        """Return the content of sample.json, with presets spelled out, so that a changed preset is another sample."""
         return {"version": VERSION, **asdict(self), "degradation": asdict(resolve_degradation(self.degradation))}
 
 
 def is_sample(folder: Path, config: SampleConfig) -> bool:
-    """Return whether ``folder`` holds the complete sample of this very config."""
+    """Return whether ``folder`` holds the complete sample of this config."""
     try:
         return json.loads((folder / SAMPLE_FILE).read_text(encoding="utf-8")) == config.as_dict()
-    except (OSError, ValueError):  # sample.json is missing or damaged
+    except (OSError, ValueError):  # The file is missing or damaged.
         return False
 
 
@@ -115,16 +115,16 @@ def write_sample(
     for train views, none for dropped ones, exact for test views), classes.json, seed_points.ply, and under
     ground_truth/ the exact masks/<stem>.png, silhouettes/<object>/<stem>.png (0 or 255), for test views
     seen/<object>/<stem>.png (the part of the silhouette whose surface training photos show) and, where the photo shows
-    the object, removed/<object>/<stem>.png (the photo with the object cut out, in the light as it was) and
-    removed_shown/<object>/<stem>.png (where in the silhouette this is surface that some training photo shows), and
+    the object, removed/<object>/<stem>.png (the photo with the object cut out, in unchanged light) and
+    removed_shown/<object>/<stem>.png (the part of the silhouette where this surface is in some training photo), and
     depth/<stem>.npy (float32, z along the optical axis); masks and depth are those of the pixel centres. sample.json is
-    the config. seed_tracks.json says which training photos show each seed point: ``photos``, their stems, and
+    the config. seed_tracks.json lists the training photos that show each seed point: ``photos``, their stems, and
     ``points``, indices of photos for each point of seed_points.ply. Seed points have the colours of the mean exposure,
-    pictures without an object the exposure of their photo: a rendering must be brought to that before it is compared.
+    pictures without an object the exposure of their photo, which a rendering must have before it is compared.
 
-    All is written into a temporary folder beside it and renamed at the end: an interrupted run leaves no ``folder``.
-    A folder that holds another sample is replaced; one that another program has made of ``config`` meanwhile is kept.
-    progress: called as ``progress(done, total)`` after each view.
+    All is written into a temporary folder beside ``folder`` and renamed at the end, so that an interrupted run leaves
+    nothing. A folder that holds another sample is replaced; one that another program has made of ``config`` meanwhile
+    stays. progress: called as ``progress(done, total)`` after each view.
     Raises ``UserError`` for a bad config, or if ``folder`` holds something that is no sample.
     """
     config = config or SampleConfig()
@@ -144,7 +144,7 @@ def write_sample(
         with writing(target):
             _build(built, config, progress)
             try:
-                if is_sample(target, config):  # by now
+                if is_sample(target, config):  # Another program has made it meanwhile.
                     return target
                 if (target / SAMPLE_FILE).is_file():
                     target.rename(partial / "old")
@@ -168,11 +168,13 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
     ends = [config.num_points * i // len(train) for i in range(len(train) + 1)]
     shares = {name: end - first for name, first, end in zip(train, ends[:-1], ends[1:], strict=True)}
     names = shots[0].still.class_names
-    for sub in ("images", "masks", *_truth_folders(names)):
+    kinds = ("silhouettes", "seen", "removed", "removed_shown")
+    objects = [f"ground_truth/{kind}/{name}" for kind in kinds for class_id, name in names.items() if class_id]
+    for sub in ("images", "masks", "ground_truth/masks", "ground_truth/depth", *objects):
         (folder / sub).mkdir(parents=True)
     seeds: list[SeedPoints] = []
     surfaces: list[list[np.ndarray]] = [[] for _ in shots[0].still.things]
-    photos: list[Photo] = []  # those to train on
+    photos: list[Photo] = []  # the training photos
     silhouettes: dict[str, np.ndarray] = {}
     for done, (shot, picture) in enumerate(taken(shots, config.antialias), start=1):
         view, scene = shot.view, shot.scene
@@ -191,12 +193,12 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
                 surface.append(part)
             mask = flawed_mask(mask, picture.depth, view, flaws)
             mask = degrade_mask(mask, len(names), degradation, config.seed, view.name)
-            # One generator per view, so that no view's points depend on another's picture.
+            # Each view has a generator, so that its points do not depend on other pictures.
             generator = np.random.default_rng([config.seed, 6, done])
-            found = seed_points(view, picture, shot.lasting(picture), shares[view.name], POINT_NOISE, generator)
-            if shot.exposed is not shot.light:  # the points have the colours of the mean exposure
-                found.paint(render_pixels(scene, shot.light, view, found.pixels, config.antialias))
-            seeds.append(found)
+            points = seed_points(view, picture, shot.lasting(picture), shares[view.name], POINT_NOISE, generator)
+            if shot.exposed is not shot.light:  # The points have the colours of the mean exposure.
+                points.paint(render_pixels(scene, shot.light, view, points.pixels, config.antialias))
+            seeds.append(points)
         if view.name not in dropped:
             _write_png(folder / "masks" / f"{view.name}.png", mask)
         if progress is not None:
@@ -204,10 +206,9 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
     whole = [well_seen(surface) for surface in surfaces]
     for shot in shots:
         if shot.view.name in silhouettes:
-            _write_seen(folder, shot.view, whole, silhouettes[shot.view.name], names)
-            _write_removed_shown(folder, shot, photos, silhouettes[shot.view.name])
+            _write_shown(folder / "ground_truth", shot, whole, photos, silhouettes[shot.view.name])
     with open(folder / "seed_points.ply", "wb") as file:
-        write_vertices(file, np.concatenate([found.records for found in seeds]))
+        write_vertices(file, np.concatenate([points.records for points in seeds]))
     tracks = {"photos": train, "points": find_tracks(seeds, photos, family.turns)}
     (folder / TRACKS_FILE).write_text(json.dumps(tracks) + "\n", encoding="utf-8")
     _write_json(folder / "classes.json", {str(i): name for i, name in names.items()})
@@ -216,7 +217,7 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
 
 
 def transforms(views: list[View]) -> dict[str, Any]:
-    """Return nerfstudio's transforms.json: one lens, frames sorted by name, and which of them are for training."""
+    """Return nerfstudio's transforms.json: one lens, frames sorted by name, and the split."""
     lens = views[0]
 
     def of(split: str) -> list[str]:
@@ -233,7 +234,7 @@ def transforms(views: list[View]) -> dict[str, Any]:
         **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
         "ply_file_path": "seed_points.ply",
         "train_filenames": of("train"),
-        # nerfstudio asks for "val" while training and refuses a file that names some splits but not that one.
+        # nerfstudio reads "val" while training, and refuses a file that names other splits but not this one.
         "val_filenames": of("test"),
         "test_filenames": of("test"),
         "frames": [
@@ -241,12 +242,6 @@ def transforms(views: list[View]) -> dict[str, Any]:
             for view in views
         ],
     }
-
-
-def _truth_folders(names: dict[int, str]) -> list[str]:
-    kinds = ("silhouettes", "seen", "removed", "removed_shown")
-    objects = [f"ground_truth/{kind}/{name}" for kind in kinds for class_id, name in names.items() if class_id]
-    return ["ground_truth/masks", "ground_truth/depth", *objects]
 
 
 def _write_truth(folder: Path, view: View, picture: Picture, names: dict[int, str]) -> None:
@@ -257,26 +252,22 @@ def _write_truth(folder: Path, view: View, picture: Picture, names: dict[int, st
         _write_png(truth / "silhouettes" / names[class_id] / f"{view.name}.png", np.uint8(255) * silhouette)
 
 
-def _write_seen(
-    folder: Path, view: View, surfaces: list[np.ndarray], silhouettes: np.ndarray, names: dict[int, str]
+def _write_shown(
+    truth: Path, shot: Shot, surfaces: list[np.ndarray], photos: list[Photo], silhouettes: np.ndarray
 ) -> None:
-    for class_id, (surface, silhouette) in enumerate(zip(surfaces, silhouettes, strict=True), start=1):
-        seen = np.uint8(255) * seen_part(view, surface, silhouette)
-        _write_png(folder / "ground_truth" / "seen" / names[class_id] / f"{view.name}.png", seen)
-
-
-def _write_removed_shown(folder: Path, shot: Shot, photos: list[Photo], silhouettes: np.ndarray) -> None:
+    """Write the parts of a test view's silhouettes where training photos show the object, and the surface behind it."""
     scene, view = shot.scene, shot.view
-    for class_id, silhouette in enumerate(silhouettes, start=1):
+    for class_id, (surface, silhouette) in enumerate(zip(surfaces, silhouettes, strict=True), start=1):
         place = Path(scene.class_names[class_id]) / f"{view.name}.png"
-        if (folder / "ground_truth/removed" / place).exists():
-            shown = np.zeros(silhouette.shape, np.uint8)
-            shown[silhouette] = 255 * shown_points(surface_without(scene, view, silhouette, class_id), photos)
-            _write_png(folder / "ground_truth/removed_shown" / place, shown)
+        _write_png(truth / "seen" / place, np.uint8(255) * seen_part(view, surface, silhouette))
+        if (truth / "removed" / place).exists():
+            behind = np.zeros(silhouette.shape, np.uint8)
+            behind[silhouette] = 255 * shown_points(surface_without(scene, view, silhouette, class_id), photos)
+            _write_png(truth / "removed_shown" / place, behind)
 
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:
-    """Write [H, W] uint8 grey or [H, W, 3] uint8 RGB."""
+    """Write an image [H, W] uint8 grey or [H, W, 3] uint8 RGB."""
     from PIL import Image
 
     Image.fromarray(pixels).save(path)
@@ -289,9 +280,9 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
 def make_sample(
     folder: Path, seed: int, width: int, height: int, degradation: str, views: int = 60, **options: Any
 ) -> None:
-    """Generate the sample with ``views`` training views in ``folder`` unless the same one lies there already.
+    """Generate the sample with ``views`` training views in ``folder``, unless ``folder`` holds it already.
 
-    options: others of ``SampleConfig``.
+    options: other options of ``SampleConfig``.
     """
     config = SampleConfig(seed, width, height, views, degradation=degradation, **options)
     with progress_bar("Tracing the sample") as progress:

@@ -1,7 +1,7 @@
-"""Files in a world far from 0, as map coordinates are: single precision would tear Gaussians and surfaces apart there.
+"""Files in a world far from 0, such as map coordinates, where single precision would tear Gaussians apart.
 
-Everything is made about a local origin. Formats that can hold it get the world's coordinates in double precision
-afterwards; ``ORIGIN_FILE`` beside the others says where their origin lies.
+Files are written relative to a local origin. Formats with double precision are moved to the world's coordinates
+afterwards; ``ORIGIN_FILE`` beside the others holds their origin.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from beags_plugin.system.reading.ply import read_vertices, write_vertices
 from beags_plugin.system.reading.text import load_json, reason
 
 FAR = 16.0
-"""Distance of a run's middle from 0, in the reach of its cameras, from which single precision does not do."""
-_HEADER = 4096  # bytes, in which comments of a .ply of ours stand
+"""Distance of a run's middle from 0, over the reach of its cameras, above which single precision is too coarse."""
+_HEADER = 4096  # bytes at the start of our .ply files that hold their comments
 ORIGIN_FILE = "origin.json"
-"""{"origin": [x, y, z], "files": [names]}: the point of the input's world that is 0 in these files beside it."""
+"""{"origin": [x, y, z], "files": [names]}: the point of the input's world that is 0 in the named files beside it."""
 
 
 def local_origin(transform: Tensor, scale: float) -> Tensor | None:
     """Return a round point [3] float64 of the input's world near the middle of a run; None for a world near 0.
 
-    transform, scale: x' = scale (R x + t) with R | t [3, 4], whose cameras reach to about 1.
+    transform, scale: x' = scale (R x + t) with R | t [3, 4]; the cameras' x' reach to about 1.
     """
     matrix = transform.detach().double().cpu()
     middle = -matrix[:, :3].T @ matrix[:, 3]
@@ -71,7 +71,7 @@ def to_world(path: Path, origin: Tensor) -> bool:
         moved[name] = table[name]
     for axis, value in zip("xyz", origin.tolist(), strict=True):
         moved[axis] += value
-    del table  # it may be a view of the file
+    del table  # The table may map the file, which is replaced below.
     with whole_file(path) as part, open(part, "wb") as file:
         write_vertices(file, moved, comment)
     return True
@@ -90,18 +90,18 @@ def _move_obj(path: Path, origin: list[float]) -> None:
 
 
 def write_origin(folder: Path, origin: Tensor, files: list[str]) -> Path:
-    """Say beside files in ``folder`` where their origin lies; other files that it names already stay named."""
+    """Write the origin of ``files`` into ``ORIGIN_FILE`` in ``folder``; it keeps other files of the same origin."""
     path = folder / ORIGIN_FILE
     former = _read(path) if path.is_file() else {}
-    kept = former.get("files", []) if former.get("origin") == origin.tolist() else []
-    content = {"origin": origin.tolist(), "files": sorted({*kept, *files})}
+    others = former.get("files", []) if former.get("origin") == origin.tolist() else []
+    content = {"origin": origin.tolist(), "files": sorted({*others, *files})}
     with whole_file(path) as part:
         part.write_text(json.dumps(content, indent=1), "utf8")
     return path
 
 
 def unlist(folder: Path, names: Collection[str]) -> None:
-    """Take files that were written anew out of ``ORIGIN_FILE``; the last one takes that with it."""
+    """Remove rewritten files from ``ORIGIN_FILE``, and remove it with the last one."""
     path = folder / ORIGIN_FILE
     if not path.is_file():
         return
@@ -115,7 +115,7 @@ def unlist(folder: Path, names: Collection[str]) -> None:
 
 
 def origin_of(path: Path) -> Tensor | None:
-    """Return the origin [3] float64 that ``ORIGIN_FILE`` beside a file gives it; None if it is not named there."""
+    """Return the origin [3] float64 of a file by ``ORIGIN_FILE`` beside it; None if the file is not named there."""
     beside = path.parent / ORIGIN_FILE
     content = _read(beside) if beside.is_file() else {}
     return torch.tensor(content["origin"], dtype=torch.float64) if path.name in content.get("files", []) else None
@@ -147,14 +147,17 @@ def double_means(path: Path, count: int) -> Tensor | None:
     return torch.from_numpy(np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float64))
 
 
-def said_of_far(origin: Tensor, in_world: bool, others: bool) -> str:
-    """Return a sentence on how files of a world far from 0 were written."""
+def far_world_note(origin: Tensor, in_world: bool, others: bool) -> str:
+    """Return a sentence on how files of a world far from 0 were written.
+
+    in_world: some files are in the world's coordinates. others: some are relative to ``origin``.
+    """
     at = ", ".join(f"{value:g}" if abs(value) < 1e6 else f"{value:.0f}" for value in origin.tolist())
     parts = []
     if in_world:
-        parts.append("places in .ply, .obj, .glb and splats of USD are in double precision")
+        parts.append("positions in .ply, .obj, .glb and splats of USD are in double precision")
     if not in_world and not others:
-        parts.append(f"the files' origin is the point {at} of it")
+        parts.append(f"the files' origin is its point {at}")
     if others:
         which = "the other" if in_world else "the"
         parts.append(f"{which} files are relative to {at}, as {ORIGIN_FILE} beside them says")

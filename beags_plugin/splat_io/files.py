@@ -1,4 +1,4 @@
-"""Files made for a user: whole or not at all, or a user error."""
+"""Files written for a user: they appear whole or not at all, and errors are user errors."""
 
 from __future__ import annotations
 
@@ -10,12 +10,18 @@ from beags_plugin.system.errors import writing
 from beags_plugin.system.whole_files import put_in_place, unfinished
 
 
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file as ``whole_file`` does."""
+    with whole_file(path) as part:
+        part.write_bytes(content)
+
+
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
-    """Yield a path beside ``path`` to write to, and move what was written into place; makes the folder.
+    """Yield a path beside ``path`` to write to, then move the written file into place; makes the folder.
 
-    A program that has the old file mapped must not lose the ground under it. Raises ``UserError`` if the file cannot
-    be written.
+    The old file is never overwritten, because a program may have it mapped. Raises ``UserError`` if the file cannot be
+    written.
     """
     path = Path(path)
     part = unfinished(path)

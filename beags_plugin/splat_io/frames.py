@@ -13,15 +13,14 @@ from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.system.errors import UserError
 
-# Orthonormality is checked to this: the matrices are written as float32 by way of JSON.
-_ORTHONORMAL_TOLERANCE = 1e-4
+_ORTHONORMAL_TOLERANCE = 1e-4  # The matrices passed through JSON as float32.
 
 
 def to_input_frame(surfels: Surfels, transform: Tensor, scale: float) -> Surfels:
-    """Undo x' = scale (R x + t): the same surfels, seen the same, in the frame of the input poses.
+    """Undo x' = scale (R x + t): return the same surfels in the frame of the input poses.
 
-    Positions p = R^T (x' / scale - t), rotations R^T R', scales divided by ``scale``; colours keep their look: the
-    spherical harmonics turn along.
+    Positions become R^T (x' / scale - t), rotations R^T R', scales are divided by ``scale``; the spherical harmonics
+    turn along, so that the surfels look the same.
 
     surfels: N surfels in the frame of x'. transform: [3, 4] float, R | t; R a rotation. scale: positive.
     Returns N surfels of the same dtype and device. Raises ``UserError`` if R is no rotation or scale is not positive.
@@ -58,7 +57,7 @@ def _checked(transform: Tensor, scale: float, like: Tensor) -> tuple[Tensor, Ten
 
 
 def _turned(surfels: Surfels, means: Tensor, rotation: Tensor, factor: float) -> Surfels:
-    """Return surfels at ``means`` [N, 3] float64, turned by ``rotation`` [3, 3] and ``factor`` times as large."""
+    """Return the surfels at ``means`` [N, 3] float64, turned by ``rotation`` [3, 3] and ``factor`` times as large."""
     dtype = surfels.means.dtype
     return Surfels.of(
         means=means.to(dtype),
@@ -83,7 +82,7 @@ def turned_gaussians(gaussians: Gaussians, rotation: Tensor, factor: float = 1.0
 def quat_from_rotation(rotation: Tensor) -> Tensor:
     """Return the unit quaternion [4] wxyz of a rotation matrix [3, 3].
 
-    q q^T is linear in the matrix, so q is the column of largest diagonal, normalised: no division by a small number.
+    4 q q^T is linear in the matrix, and its column of largest diagonal, normalised, is q: no small divisor occurs.
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
     outer = rotation.new_tensor(
@@ -112,14 +111,14 @@ def rotate_sh(sh: Tensor, rotation: Tensor, degree: int) -> Tensor:
     after = _basis(directions @ rotation.T, degree)
     for band in range(1, degree + 1):
         columns = slice(band**2, (band + 1) ** 2)
-        # after @ g = before @ f at every direction
+        # The matrix solves after @ matrix = before at every direction.
         matrix = torch.linalg.lstsq(after[:, columns], before[:, columns]).solution
         turned[:, columns] = torch.einsum("ij,njc->nic", matrix, sh[:, columns].double()).to(sh.dtype)
     return turned
 
 
 def _sphere(count: int) -> Tensor:
-    """Return [count, 3] float64 unit directions, evenly spread on a spiral for a well-conditioned fit."""
+    """Return [count, 3] float64 unit directions, spread evenly on a spiral, so that the fit is well conditioned."""
     step = torch.arange(count, dtype=torch.float64) + 0.5
     z = 1 - 2 * step / count
     angle = step * (torch.pi * (3 - 5**0.5))
@@ -130,8 +129,8 @@ def _sphere(count: int) -> Tensor:
 def _basis(directions: Tensor, degree: int) -> Tensor:
     """Return the basis functions at unit directions [D, 3], [D, (degree + 1)^2], from the renderer's own colours.
 
-    Read off ``sh_colors`` so that order and signs are the renderer's. The factor 0.1 keeps the
-    colour, 0.1 * basis + 0.5, off the clamp at 0.
+    ``sh_colors`` gives the renderer's order and signs. The factor 0.1 keeps the colour, 0.1 * basis + 0.5, above the
+    clamp at 0.
     """
     count, bases = directions.shape[0], (degree + 1) ** 2
     sh = 0.1 * torch.eye(bases, dtype=directions.dtype, device=directions.device)[:, :, None].expand(-1, -1, 3)

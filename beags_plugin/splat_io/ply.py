@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Literal
 
@@ -14,14 +15,13 @@ from beags_plugin.core.sh import MAX_DEGREE, num_sh_bases
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.splat_io.files import whole_file
 from beags_plugin.splat_io.frames import to_input_frame
-from beags_plugin.splat_io.splat_file import numbered, read_splat_file
-from beags_plugin.system.errors import UserError
+from beags_plugin.splat_io.splat_file import numbered
 from beags_plugin.system.reading.ply import write_vertices
 
 DISC_COMMENT = "SplatRenderMode: 2dgs"
-"""Comment of .ply files whose Gaussians are discs, which PlayCanvas' programs and Brush know."""
+"""Comment of .ply files whose Gaussians are discs; PlayCanvas' programs and Brush read it."""
 THICKNESS = 1e-3
-"""Written third scale, relative to the smaller of the two: flat, yet no viewer divides by 0."""
+"""Third scale in files, relative to the smaller of the two: flat, yet no viewer divides by 0."""
 
 
 def write_ply(
@@ -36,8 +36,8 @@ def write_ply(
 
     Columns: x y z; nx ny nz, the surfel's normal; f_dc_0..2; f_rest_* channel-major (red, then green, then blue);
     opacity as a logit; scale_0..2 as logs, the third ``THICKNESS`` times the smaller of the two for viewers of 3D
-    Gaussians; rot_0..3 wxyz, unit length. 2DGS's layout has two scales and always 45 f_rest columns, padded with 0, as
-    the official code expects for its default SH degree 3, and a comment for PlayCanvas' programs.
+    Gaussians; rot_0..3 wxyz, unit length. The layout of 2DGS has two scales, 45 f_rest columns padded with 0, because
+    the official code expects SH degree 3, and a comment for PlayCanvas' programs.
 
     surfels: N surfels. class_ids: [N] integer, phi. transform: the dataparser's ([3, 4], scale); with it the
     file is in the frame of the input poses, without it in the surfels' own. invented: [N] bool, the last column, of
@@ -59,12 +59,16 @@ def write_ply(
         write_vertices(file, table, DISC_COMMENT if layout == "2dgs" else "")
 
 
+def thin_log_scales(log_scales: Tensor) -> Tensor:
+    """Return log scales [N, 2] as those of 3D Gaussians, [N, 3]: the third is ``THICKNESS`` times the smaller one."""
+    return torch.cat([log_scales, log_scales.amin(dim=-1, keepdim=True) + math.log(THICKNESS)], dim=-1)
+
+
 def _columns(surfels: Surfels, layout: str) -> dict[str, np.ndarray]:
     quats = torch.nn.functional.normalize(surfels.quats.detach(), dim=-1)
     normals = rotation_from_quat(quats)[:, :, 2]
     log_scales = surfels.log_scales.detach()
-    thin = log_scales.amin(dim=-1, keepdim=True) + float(np.log(THICKNESS))
-    scales = torch.cat([log_scales, thin], dim=-1) if layout == "3dgs" else log_scales
+    scales = thin_log_scales(log_scales) if layout == "3dgs" else log_scales
     rest = surfels.sh_rest.detach()
     if layout == "2dgs":
         rest = torch.cat([rest, rest.new_zeros(len(rest), num_sh_bases(MAX_DEGREE) - 1 - rest.shape[1], 3)], dim=1)
@@ -83,17 +87,3 @@ def _columns(surfels: Surfels, layout: str) -> dict[str, np.ndarray]:
         for names, values in blocks.items()
         for i, name in enumerate(names)
     }
-
-
-def read_ply(path: str | Path) -> tuple[Surfels, Tensor | None]:
-    """Read a surfel .ply: one that ``write_ply`` wrote, or a 2DGS one with two scales.
-
-    Returns (N surfels in float32, class_ids [N] int32 or None if the file has none). Raises ``UserError`` if
-    the file is missing, is no splat .ply, or holds Gaussians that are not flat along their third axis.
-    """
-    read = read_splat_file(path)
-    found, flat = read.gaussians, read.gaussians.log_scales[:, :2]
-    if bool((found.log_scales[:, 2:] > flat.amin(dim=1, keepdim=True)).any()):
-        raise UserError(f"{path} holds 3D Gaussians, not surfels: their third scale is not the smallest.")
-    surfels = Surfels(found.means, found.quats, flat.contiguous(), found.opacity_logits, found.sh_dc, found.sh_rest)
-    return surfels, read.class_ids

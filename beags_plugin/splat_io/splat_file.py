@@ -1,4 +1,4 @@
-"""Reading splat .ply files of anyone: flat Gaussians or with volume, checked before anything of their size is made."""
+"""Read splat .ply files of any program, with flat or 3D Gaussians; they are checked before memory is allocated."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beags_plugin.core.densification import SH_C0
 from beags_plugin.core.flattening import Gaussians
-from beags_plugin.core.sh import MAX_DEGREE, num_sh_bases
+from beags_plugin.core.sh import MAX_DEGREE, SH_C0, num_sh_bases
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.colors import range_of
 from beags_plugin.system.reading.ply import read_vertices
@@ -23,7 +22,7 @@ from beags_plugin.system.reading.text import reason
 class SplatFile:
     """Content of a .ply: N Gaussians with two or three scales, in float32, and class_ids [N] int32 if it has them.
 
-    remarks: sentences on what a reader must know of it, such as what it lacks.
+    remarks: sentences for the user, such as what the file lacks.
     """
 
     gaussians: Gaussians
@@ -35,8 +34,8 @@ def read_splat_file(path: str | Path) -> SplatFile:
     """Read the vertices of a splat .ply in the layout of 3DGS, 2DGS or ns-export, binary or text.
 
     Columns: x y z, f_dc_0..2 (or red green blue), f_rest_* channel-major (whole bands; those above degree 3 are left
-    out), opacity (logit), scale_0..1 or 0..2 (logs), rot_0..3 (wxyz), class_id if there. Values are as they are, finite
-    or not. Raises ``UserError`` if the file cannot be read, is no splat .ply, or is shorter than its header says.
+    out), opacity (logit), scale_0..1 or 0..2 (logs), rot_0..3 (wxyz), class_id if present. Values need not be finite.
+    Raises ``UserError`` if the file cannot be read, is no splat .ply, or is shorter than its header says.
     """
     path = Path(path)
     try:
@@ -56,7 +55,7 @@ def read_splat_file(path: str | Path) -> SplatFile:
     as_rgb = colors[0] not in present and "red" in present
     if as_rgb:
         colors = ("red", "green", "blue")
-    as_rgb = as_rgb or (colors[0] in present and _whole(vertex, colors[0]))  # shares of 1 in bytes, whatever their name
+    as_rgb = as_rgb or (colors[0] in present and _whole(vertex, colors[0]))  # Bytes are shares of 1.
     blocks = [("x", "y", "z"), colors, ("opacity",), numbered("scale", 3 if "scale_2" in present else 2)]
     blocks += [numbered("rot", 4), numbered("f_rest", rest_count)]
     if missing := sorted({name for block in blocks for name in block} - present):
@@ -91,7 +90,7 @@ def _whole(vertex: np.ndarray, name: str) -> bool:
 
 
 def shares(values: np.ndarray) -> Tensor:
-    """Return values [N, C] of any type as shares of 1, float32, by the type and the range as those of seed points."""
+    """Return values [N, C] of any type as shares of 1, float32; the range decides, as for colours of seed points."""
     values, most = range_of(values)
     return torch.from_numpy((values / (most or 1.0)).astype(np.float32))
 

@@ -1,4 +1,4 @@
-"""Colours of a surface from photos: from those that see a place, the steep and near ones most, exposures evened out."""
+"""Colours of a surface from the photos that see it, weighted by angle and distance, with exposures evened out."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from beags_plugin.surfaces.item import Photo
 from beags_plugin.surfaces.surface import in_voxels, surface_of
 from beags_plugin.system.open3d_kernels import open3d_kernels
 
-_OFF = 1.0  # voxels above the surface, where rays to the camera start
+_OFF = 1.0  # distance from the surface at which rays to the camera start, voxels
 FLATTEST = 0.2  # least cosine between normal and ray: flatter views smear
-_SHARPEN = 3  # the power of a view's weight: more follow the best view, fewer blur what views place differently
-_PRIOR = 1e-6  # weight of the splats' colour, beside 1 of a photo that looks straight on at a pixel for a texel
-_SAMPLES = 8000  # places that exposures are compared at
-_ALIKE = 0.05  # standard deviation of log exposures below which they are not told from errors of the surface
+_SHARPEN = 3  # power of a view's weight: a higher one follows the best view, a lower one blurs where views disagree
+_PRIOR = 1e-6  # weight of the splats' colour; a photo that faces a place with one pixel per texel has 1
+_SAMPLES = 8000  # places at which exposures are compared
+_ALIKE = 0.05  # standard deviation of log exposures below which they may be errors of the surface
 
 
 @dataclass(frozen=True)
 class Places:
-    """P places on a surface: points [P, 3] float64, unit normals [P, 3]; spacing: between them, in the points' unit."""
+    """P places on a surface: points [P, 3] float64, unit normals [P, 3]; spacing: their distance, in the same unit."""
 
     points: np.ndarray
     normals: np.ndarray
@@ -38,13 +38,13 @@ class Places:
         return replace(self, points=self.points[chosen], normals=self.normals[chosen])
 
 
-Shown = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Which places a photo shows, their light, and their weights."""
+Observations = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Places that a photo shows, their light, and their weights."""
 
 
 @dataclass(frozen=True)
 class Baked:
-    """colors: [P, 3] float64, sRGB 0..1. seen: [P] bool, by a photo. exposures: [V, 3] of photos, 1 for their mean."""
+    """Colours [P, 3] float64, sRGB 0..1; seen: [P] bool, whether a photo shows a place; exposures: [V, 3], mean 1."""
 
     colors: np.ndarray
     seen: np.ndarray
@@ -58,18 +58,17 @@ def baked(
     prior: np.ndarray,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Baked:
-    """Return the colours of places on a mesh as photos show them.
+    """Return the colours of places on a mesh from photos.
 
-    A photo shows a place if its pixel is well inside the item's mask, nothing of the scene stands before it, and the
-    mesh itself does not hide it. Its weight is the third power of the pixels that it has for the area between places.
-    prior: [P, 3] sRGB 0..1, the colours where no photo shows anything. progress: receives (done, total) photos, each of
-    which is looked at twice.
+    A photo shows a place if its pixel is well inside the item's mask, and neither the scene nor the mesh itself hides
+    it. Its weight is the third power of the number of pixels per place. prior: [P, 3] sRGB 0..1, the colours of places
+    that no photo shows. progress: receives (done, total) photos, each of which is read twice.
     """
     caster = surface_of(mesh)
     step = max(1, len(places.points) // _SAMPLES)
     some = places[::step]
-    shown = (places_seen(some, mesh, caster, photo) for photo in photos)
-    exposures = exposures_of(len(some.points), len(photos), shown, lambda done: progress(done, 2 * len(photos)))
+    observed = (places_seen(some, mesh, caster, photo) for photo in photos)
+    exposures = exposures_of(len(some.points), len(photos), observed, lambda done: progress(done, 2 * len(photos)))
     total = _PRIOR * linear_from_srgb(prior)
     weights = np.full(len(places.points), _PRIOR)
     for done, (photo, exposure) in enumerate(zip(photos, exposures, strict=True), start=1):
@@ -80,8 +79,8 @@ def baked(
     return Baked(srgb_from_linear(total / weights[:, None]), weights > _PRIOR, exposures)
 
 
-def places_seen(places: Places, mesh: Mesh, caster: Any, photo: Photo) -> Shown:
-    """Return which places a photo shows, [M] int64, their light [M, 3] there and its weights [M]."""
+def places_seen(places: Places, mesh: Mesh, caster: Any, photo: Photo) -> Observations:
+    """Return the places that a photo shows, [M] int64, their light [M, 3] and its weights [M]."""
     camera = photo.camera
     xy, z = (values.numpy() for values in project(torch.from_numpy(places.points), camera.to(torch.float64)))
     towards = camera.center.double().numpy() - places.points
@@ -96,19 +95,19 @@ def places_seen(places: Places, mesh: Mesh, caster: Any, photo: Photo) -> Shown:
     index = index[well_inside(photo)[row, column] & ~((depth > 0) & (depth < (1.0 - TAU) * z[index]))]
     index = index[~_hidden(caster, mesh, places[index], camera.center.double().numpy())]
     light = linear_from_srgb(interpolated(photo.image(), xy[index]))
-    pixels = cosine[index] * (camera.focal * places.spacing / z[index]) ** 2  # for the area of a place
+    pixels = cosine[index] * (camera.focal * places.spacing / z[index]) ** 2  # pixels per place
     return index, light, np.minimum(pixels, 4.0) ** _SHARPEN
 
 
 def well_inside(photo: Photo) -> np.ndarray:
-    """Return [H, W] bool, the pixels of a photo's mask that are no edge: those mix with what is behind."""
+    """Return [H, W] bool, the pixels of a photo's mask without its edge, where colours mix with those behind."""
     edge = photo.edge
     around = torch.nn.functional.pad((~photo.own()).float()[None, None], (edge, edge, edge, edge))
     return (torch.nn.functional.max_pool2d(around, 2 * edge + 1, stride=1)[0, 0] == 0).numpy()
 
 
 def _hidden(caster: Any, mesh: Mesh, places: Places, center: np.ndarray) -> np.ndarray:
-    """Return [P] bool, whether the mesh stands between places and the camera at ``center`` [3]."""
+    """Return [P] bool, whether the mesh lies between places and the camera at ``center`` [3]."""
     open3d = open3d_kernels()
 
     starts = in_voxels(mesh, places.points + _OFF * mesh.voxel * places.normals).numpy()
@@ -118,7 +117,7 @@ def _hidden(caster: Any, mesh: Mesh, places: Places, center: np.ndarray) -> np.n
 
 
 def interpolated(image: Tensor, xy: np.ndarray) -> np.ndarray:
-    """Return [M, 3] float64, an image [H, W, 3] at pixel coordinates [M, 2], between the four nearest centres."""
+    """Return an image [H, W, 3] at pixel coordinates [M, 2], bilinearly interpolated; [M, 3] float64."""
     height, width = image.shape[:2]
     pixels = image.double().numpy()
     at = xy - 0.5
@@ -129,22 +128,24 @@ def interpolated(image: Tensor, xy: np.ndarray) -> np.ndarray:
     return (1 - v) * top + v * ((1 - u) * pixels[below, x] + u * pixels[below, right])
 
 
-def exposures_of(places: int, count: int, shown: Iterable[Shown], progress: Callable[[int], None]) -> np.ndarray:
-    """Return [V, 3], how many times as bright as the mean each photo shows places, by colour.
+def exposures_of(
+    places: int, count: int, observed: Iterable[Observations], progress: Callable[[int], None]
+) -> np.ndarray:
+    """Return the brightness of each photo relative to the photos' mean, by colour, [V, 3].
 
-    places, count: their number P, and that of photos, V. shown: what ``places_seen`` returns of each photo.
-    By ``core.exposure.even_exposures``; rounded, so that no last bit of a solver tells.
+    places, count: the numbers of places, P, and of photos, V. observed: ``places_seen`` of each photo.
+    ``core.exposure.even_exposures`` solves for them; rounding removes the solver's last bits, which differ by machine.
     """
     logs, weights = (np.zeros((places, count, 3)) for _ in range(2))
-    for view, (index, light, weight) in enumerate(shown):
+    for view, (index, light, weight) in enumerate(observed):
         usable = (light > DARK) & (light < BRIGHT)
         logs[index, view] = np.log(np.where(usable, light, 1.0))
         weights[index, view] = usable * np.minimum(weight, 1.0)[:, None] ** (1 / _SHARPEN)
         progress(view + 1)
-    found = np.zeros((count, 3))
+    exposures = np.zeros((count, 3))
     for channel in range(3):
         place, view = np.nonzero(weights[..., channel])
         seen = place, view, channel
-        found[:, channel] = even_exposures(place, view, logs[seen], weights[seen], count)[0]
-    found -= found.mean(axis=0)
-    return np.exp(np.round(np.where(found.std(axis=0) < _ALIKE, 0.0, found), 5))
+        exposures[:, channel] = even_exposures(place, view, logs[seen], weights[seen], count)[0]
+    exposures -= exposures.mean(axis=0)
+    return np.exp(np.round(np.where(exposures.std(axis=0) < _ALIKE, 0.0, exposures), 5))

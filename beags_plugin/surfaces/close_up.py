@@ -1,4 +1,4 @@
-"""Training views turned into close-ups: the same place and direction, the picture filled by the object's box."""
+"""Close-ups of training views: the same position and direction, with the image filled by the object's box."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import project
 
-_MARGIN = 2  # pixels around the box: an ellipse of one standard deviation is not all that a surfel shows
+_MARGIN = 2  # pixels around the box, because surfels reach beyond one standard deviation
 
 
 def close_up(camera: Camera, low: Tensor, high: Tensor, near: float, pixels: int) -> Camera:
-    """Return the part of a view that holds a box, its longer side ``pixels`` long.
+    """Return the part of a view that contains a box, with a longer side of ``pixels``.
 
     low, high: [3] corners of the box, in the camera's world. near: depth, world units; if a corner is nearer, the
-    camera is in or beside the box and keeps the photo's view. Returns a camera of at most ``pixels`` x ``pixels``;
+    camera is in or beside the box, and the whole view is returned. Returns a camera of at most ``pixels`` x ``pixels``;
     float32.
     """
     corners = torch.cartesian_prod(*torch.stack([low, high], dim=1).double())
@@ -31,6 +31,6 @@ def close_up(camera: Camera, low: Tensor, high: Tensor, near: float, pixels: int
     K = camera.K.double().clone()
     K[:2] *= zoom
     K[:2, 2] += margin - zoom * first
-    # rounded before it is rounded up: the longer side must be ``pixels``, not one more for the last bit
+    # Rounding before ``ceil`` keeps the longer side at ``pixels``: the last bit would add one more.
     width, height = (min(pixels, math.ceil(round(zoom * side, 6)) + 2 * margin) for side in size.tolist())
     return Camera(camera.viewmat.float(), K.float(), max(1, width), max(1, height))

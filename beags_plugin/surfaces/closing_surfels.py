@@ -1,4 +1,4 @@
-"""Gaussians of what no photo shows of an object: flat ones on the parts of its closed surface that are invented."""
+"""Flat Gaussians on the invented parts of an object's closed surface, which no photo shows."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from beags_plugin.core.densification import SH_C0
-from beags_plugin.core.lifting import project
+from beags_plugin.core.lifting import pixels_of
 from beags_plugin.core.rotations import rotation_from_quat
+from beags_plugin.core.sh import SH_C0
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.surfaces.closing import Closed
@@ -20,32 +20,31 @@ from beags_plugin.surfaces.meshing import closed_surface, seen_surface
 from beags_plugin.surfaces.surface import area_vectors
 
 _OPACITY = 0.99
-_SIGMA = 0.75  # standard deviation over the distance between neighbours: three of them hide what is between
-_INWARD = 0.5  # distance between neighbours over that from the rim
-_FINEST = 1.5  # distance between neighbours over that between the surface's corners
-_HALF = 1.2  # standard deviations from its middle at which an opaque Gaussian is half transparent
-_CLEAR = 2.4  # and at which it adds so little to the object's own edge that its outline stays
-_ON_SCREEN = 0.71  # pixels: the standard deviation that a Gaussian is drawn with at least (2DGS's low-pass filter)
-_LARGEST = 1 / 12  # distance between neighbours over the closed surface's longest side
-_SAME_SIDE = 0.5  # least cosine between the normals of places of one side
+_SIGMA = 0.75  # standard deviation over the distance between neighbours; three neighbours cover the gap between them
+_INWARD = 0.5  # distance between neighbours over the distance from the rim
+_FINEST = 1.5  # least distance between neighbours over that between the surface's vertices
+_HALF = 1.2  # standard deviations from its centre at which an opaque Gaussian is half transparent
+_CLEAR = 2.4  # standard deviations from its centre at which it no longer changes the object's outline
+_ON_SCREEN = 0.71  # least standard deviation of a rendered Gaussian, pixels (2DGS's low-pass filter)
+_LARGEST = 1 / 12  # largest distance between neighbours over the closed surface's longest side
+_SAME_SIDE = 0.5  # least cosine between the normals of places on one side
 
 
 @dataclass(frozen=True)
 class Added:
-    """gaussians: their number. doubt: why nothing could be closed, or ""."""
+    """The number of Gaussians that close an object, and the reason (doubt) why it could not be closed, or ""."""
 
     gaussians: int
     doubt: str = ""
 
     def __str__(self) -> str:
-        """Return a phrase for users."""
         if self.doubt:
             return f"nothing closed, as {self.doubt}"
         return f"{self.gaussians} more close what no photo shows" if self.gaussians else "nothing to close"
 
 
 def with_closing(item: ExportItem, options: MeshOptions) -> tuple[ExportItem, Added]:
-    """Return an item with Gaussians where no photo shows it, by the closed surface that the options lead to."""
+    """Return an item with Gaussians where no photo shows it, on the closed surface that the options give."""
     more, doubt = closing_gaussians(item, options)
     own = torch.zeros(len(item.surfels), dtype=torch.bool)
     if not len(more):
@@ -57,20 +56,20 @@ def with_closing(item: ExportItem, options: MeshOptions) -> tuple[ExportItem, Ad
 
 
 def closing_gaussians(item: ExportItem, options: MeshOptions) -> tuple[Surfels, str]:
-    """Return the Gaussians that close an item where no photo shows it, and why there are none, or ""."""
+    """Return the Gaussians that close an item where no photo shows it, and the reason why there are none, or ""."""
     none = item.surfels.detach()[:0]
     try:
-        mesh = seen_surface(item, options)  # where the splats are; photos would place it elsewhere
+        mesh = seen_surface(item, options)  # The surface of the splats is needed, not the one that photos align.
         if not len(mesh.faces):
             raise NothingToExport(f"no surface of {item.name!r} is seen in {options.min_views} training views")
         solid = closed_surface(item, mesh)
     except NothingToExport as error:
         return none, str(error).partition(":")[0]
-    assert item.views is not None  # the surface was seen from there
+    assert item.views is not None  # seen_surface raises without views.
     pixel = _pixel(item.views, solid.mesh.vertices)
-    wanted = closing_surfels(solid, item.surfels, pixel)
-    more = wanted[_within(wanted, item.surfels, item.views, pixel)]
-    return more, "all Gaussians there would leave its outline" if len(wanted) and not len(more) else ""
+    candidates = closing_surfels(solid, item.surfels, pixel)
+    more = candidates[_within(candidates, item.surfels, item.views, pixel)]
+    return more, "all Gaussians there would leave its outline" if len(candidates) and not len(more) else ""
 
 
 def joined(*parts: Surfels) -> Surfels:
@@ -79,16 +78,16 @@ def joined(*parts: Surfels) -> Surfels:
 
 
 def _pixel(views: Viewpoints, points: np.ndarray) -> float:
-    """Return how large a pixel is at a thing of points [P, 3], the median over the views."""
+    """Return the size of a pixel at the middle of points [P, 3], world units: the median over the views."""
     middle = torch.from_numpy((points.min(axis=0) + points.max(axis=0)) / 2)
     return float(np.median([float((each.center.double() - middle).norm()) / each.focal for each in views.cameras]))
 
 
 @torch.no_grad()
 def _within(more: Surfels, own: Surfels, views: Viewpoints, pixel: float) -> Tensor:
-    """Return [M] bool, which Gaussians lie inside the outline of an object's own ones in every view.
+    """Return [M] bool, which Gaussians lie inside the outline of the object's own Gaussians in every view.
 
-    Holes of an outline count as inside: they are what is to be closed.
+    Holes of an outline count as inside, because the Gaussians shall close them.
     """
     from scipy.ndimage import binary_fill_holes
 
@@ -98,12 +97,9 @@ def _within(more: Surfels, own: Surfels, views: Viewpoints, pixel: float) -> Ten
     points = torch.cat([more.means[:, None].double(), more.means[:, None].double() + around], dim=1)
     inside = torch.ones(len(more), dtype=torch.bool)
     for camera in views.cameras:
-        drawn = views.rasterizer.rasterize(surfel_inputs(own, camera), camera, views.settings, own.means.new_zeros(3))
-        outline = torch.from_numpy(binary_fill_holes((drawn.alpha > 0.5).numpy()))
-        xy, z = project(points.reshape(-1, 3), camera.to(torch.float64))
-        limit = torch.tensor([camera.width, camera.height])
-        framed = (z > 0) & ((xy >= 0) & (xy < limit)).all(dim=1)
-        column, row = xy.nan_to_num().floor().long().clamp(min=0).minimum(limit - 1).T
+        render = views.rasterizer.rasterize(surfel_inputs(own, camera), camera, views.settings, own.means.new_zeros(3))
+        outline = torch.from_numpy(binary_fill_holes((render.alpha > 0.5).numpy()))
+        framed, row, column, _ = pixels_of(points.reshape(-1, 3), camera.to(torch.float64))
         inside &= (outline[row, column] | ~framed).reshape(points.shape[:2]).all(dim=1)
     return inside
 
@@ -111,8 +107,8 @@ def _within(more: Surfels, own: Surfels, views: Viewpoints, pixel: float) -> Ten
 def closing_surfels(solid: Closed, like: Surfels, pixel: float) -> Surfels:
     """Return flat Gaussians on the invented parts of a closed surface, small at its rims and larger inside.
 
-    Each has the colour of its place from every side: degree 0, though they have the bands of ``like``, the object's.
-    pixel: size of a pixel of the photos at the surface; no Gaussian is drawn much smaller than that.
+    Each has the colour of its place from all directions; higher bands, as many as ``like``, the object, has, are 0.
+    pixel: size of a pixel of the photos at the surface; no Gaussian is made much smaller than that.
     """
     points, normals, colors, apart = _spread(solid, pixel)
     count, means = len(points), like.means
@@ -133,10 +129,10 @@ def closing_surfels(solid: Closed, like: Surfels, pixel: float) -> Surfels:
 
 
 def _spread(solid: Closed, pixel: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return places [P, 3] over the invented parts, unit normals and colours [P, 3] there, and distances [P].
+    """Return places [P, 3] over the invented parts, their unit normals and colours [P, 3], and distances [P].
 
-    Every place of these parts but those at the rim is as near to one of them as the distance there says. They are taken
-    in order, the farthest from the rim first; a place is left out if one that was taken is near enough.
+    The places are face centres, taken in order, the farthest from the rim first; a centre is left out if it lies within
+    the distance of one that was taken.
     """
     from scipy.spatial import KDTree
 
@@ -149,13 +145,13 @@ def _spread(solid: Closed, pixel: float) -> tuple[np.ndarray, np.ndarray, np.nda
     normals = area_vectors(replace(mesh, faces=faces))
     areas = np.linalg.norm(normals, axis=1)
     normals /= np.maximum(areas, 1e-300)[:, None]
-    spacing = float(np.sqrt(2.0 * np.median(areas)))  # of the faces' corners
+    spacing = float(np.sqrt(2.0 * np.median(areas)))  # distance of the faces' vertices
     rim = np.unique(faces[~invented[faces]])
     inward = KDTree(mesh.vertices[rim]).query(points)[0] if len(rim) else np.full(len(points), np.inf)
     longest = float(np.ptp(mesh.vertices, axis=0).max())
     finest = max(_FINEST * spacing, pixel)
     apart = np.clip(_INWARD * inward, finest, max(_LARGEST * longest, finest))
-    # up to the rim, but not beyond it: the object's own Gaussians begin there
+    # The Gaussians may reach the rim, but not cross it: the object's own Gaussians begin there.
     reach = _HALF * np.maximum(_SIGMA * apart, _ON_SCREEN * pixel)
     tree, open_ = KDTree(points), (areas > 0) & (inward > reach)
     taken = []
@@ -168,8 +164,8 @@ def _spread(solid: Closed, pixel: float) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def _quats_to(normals: np.ndarray) -> np.ndarray:
-    """Return unit quaternions [P, 4] wxyz of turns that take z to unit normals [P, 3], by the shortest way."""
+    """Return unit quaternions [P, 4] wxyz of the smallest rotations that take z to unit normals [P, 3]."""
     x, y, z = normals.T
     quats = np.stack([1.0 + z, -y, x, np.zeros_like(z)], axis=1)  # 1 + cosine, and z x normal
-    quats[z < -1.0 + 1e-9] = [0.0, 1.0, 0.0, 0.0]  # half a turn about any level axis
+    quats[z < -1.0 + 1e-9] = [0.0, 1.0, 0.0, 0.0]  # half a turn about a horizontal axis
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Between sRGB, as photos have it, and light (IEC 61966-2-1)."""
+"""Convert between sRGB, the values of photos, and linear light (IEC 61966-2-1)."""
 
 from __future__ import annotations
 
@@ -12,6 +12,6 @@ def linear_from_srgb(colors: np.ndarray) -> np.ndarray:
 
 
 def srgb_from_linear(light: np.ndarray) -> np.ndarray:
-    """Return sRGB values 0..1 of light intensities, which are cut off at 0 and 1; float64."""
+    """Return sRGB values 0..1 of light intensities, which are clamped to 0..1; float64."""
     light = np.clip(np.asarray(light, dtype=np.float64), 0.0, 1.0)
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)

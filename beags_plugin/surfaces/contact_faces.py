@@ -1,6 +1,6 @@
-"""Gaussians that close objects where they touch: the lid of a box below what stands on it.
+"""Gaussians that close objects where they touch, such as the lid of a box below another object.
 
-No photo shows such a face, so that a base has a hole there, which shows once the neighbour is gone.
+No photo shows such a face, so the base has a hole there, which becomes visible when the neighbour is removed.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.lifting import TAU, project
+from beags_plugin.core.lifting import TAU, pixels_of
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.select import select_class
@@ -23,8 +23,8 @@ from beags_plugin.surfaces.closing_surfels import closing_gaussians, joined
 from beags_plugin.surfaces.item import ExportItem, Viewpoints
 from beags_plugin.surfaces.mesh_options import MeshOptions
 
-LEAST_VIEWS = 2  # in which another object hides a place from its front
-_FACING = 0.1  # least cosine between a place's normal and the way to a camera that looks at its front
+LEAST_VIEWS = 2  # least number of views in which another object hides the front of a place
+_FACING = 0.1  # least cosine between a place's normal and the direction of a camera that faces its front
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class ContactFaces:
 
 
 class Witnesses:
-    """How many views look at the front of each of M places, by what they show there; all [M] int64.
+    """Numbers of views that face the front of each of M places, by what they show there; all [M] int64.
 
     hidden: another object before the place. open: the background before it, or anything behind it, by more than ``TAU``
-    of the depth. Views that show the own object there, and pixels without a label, say nothing.
+    of the depth. Views that show the place's own object there, and pixels without a label, do not count.
     """
 
     def __init__(self, places: Surfels, class_ids: Tensor) -> None:
@@ -50,22 +50,19 @@ class Witnesses:
         self.hidden, self.open = torch.zeros(2, len(places), dtype=torch.int64)
 
     def add(self, camera: Camera, labels: Tensor, depth: Tensor) -> None:
-        """Add a view. labels: [H, W] class ids or IGNORE. depth: [H, W] of the scene's surface, 0 where none is."""
+        """Add a view. labels: [H, W] class ids or IGNORE. depth: [H, W] of the scene's surface, 0 where it has none."""
         to_camera = torch.nn.functional.normalize(camera.center.double() - self._points, dim=1)
-        looks = (to_camera * self._normals).sum(dim=1) > _FACING
-        xy, z = project(self._points, camera.to(torch.float64))
-        limit = torch.tensor([camera.width, camera.height])
-        looks &= (z > 0) & ((xy >= 0) & (xy < limit)).all(dim=1)
-        column, row = xy.nan_to_num().floor().long().clamp(min=0).minimum(limit - 1).T
-        shown, at = labels[row, column], depth[row, column].double()
-        at = torch.where(at > 0, at, torch.inf)
-        other = (shown != self._class_ids) & (shown != IGNORE)
-        is_object = other & (shown != BACKGROUND)
-        self.hidden += looks & is_object & (at < z)
-        self.open += looks & other & ((at >= (1.0 + TAU) * z) | (~is_object & (at < (1.0 - TAU) * z)))
+        inside, row, column, z = pixels_of(self._points, camera.to(torch.float64))
+        faces = ((to_camera * self._normals).sum(dim=1) > _FACING) & inside
+        label, surface = labels[row, column], depth[row, column].double()
+        surface = torch.where(surface > 0, surface, torch.inf)
+        other = (label != self._class_ids) & (label != IGNORE)
+        is_object = other & (label != BACKGROUND)
+        self.hidden += faces & is_object & (surface < z)
+        self.open += faces & other & ((surface >= (1.0 + TAU) * z) | (~is_object & (surface < (1.0 - TAU) * z)))
 
     def in_contact(self) -> Tensor:
-        """Return [M] bool, which places another object hides, as more views say than that they lie open."""
+        """Return [M] bool, which places are hidden by another object in more views than show them open."""
         return (self.hidden >= LEAST_VIEWS) & (self.hidden > self.open)
 
 
@@ -81,14 +78,14 @@ def contact_faces(
 ) -> ContactFaces:
     """Return the Gaussians that close the objects of a scene where other objects hid them.
 
-    surfels: N Gaussians, on the CPU. names: of the classes by id. views: training views; labels: [H, W] each, None
-    where a view has none. options: of the surfaces that tell what is open. progress: receives (done, total) objects
+    surfels: N Gaussians, on the CPU. names: the classes' names by id. views: training views; labels: [H, W] each, None
+    where a view has none. options: those of the surfaces that find the holes. progress: receives (done, total) objects
     and views.
     """
-    found: list[ContactFaces] = []
-    in_scene = replace(views, scene=surfels)  # through its open lid a box alone would show its inside
+    faces: list[ContactFaces] = []
+    in_scene = replace(views, scene=surfels)  # A box alone would show its inside through its open lid.
     objects = [class_id for class_id in names if class_id != BACKGROUND and bool(members.of(class_id).any())]
-    if len(objects) < 2:  # nothing touches
+    if len(objects) < 2:  # A single object touches no other.
         objects = []
     total = len(objects) + len(views.cameras)
     for done, class_id in enumerate(objects):
@@ -96,10 +93,10 @@ def contact_faces(
         part = select_class(surfels, members, class_id)[0]
         ids = torch.full((len(part),), class_id, dtype=torch.int32)
         more = closing_gaussians(ExportItem(names[class_id], part, ids, in_scene), options)[0]
-        found.append(ContactFaces(more, torch.full((len(more),), class_id, dtype=torch.int32)))
+        faces.append(ContactFaces(more, torch.full((len(more),), class_id, dtype=torch.int32)))
     candidates = ContactFaces(
-        joined(surfels[:0], *(each.surfels for each in found)),
-        torch.cat([torch.zeros(0, dtype=torch.int32), *(each.class_ids for each in found)]),
+        joined(surfels[:0], *(each.surfels for each in faces)),
+        torch.cat([torch.zeros(0, dtype=torch.int32), *(each.class_ids for each in faces)]),
     )
     witnesses = Witnesses(candidates.surfels, candidates.class_ids)
     inputs, settings = geometry_inputs(surfels), replace(views.settings, geometry=True, distortion=False)
@@ -109,5 +106,5 @@ def contact_faces(
             render = views.rasterizer.rasterize(inputs, camera, settings, surfels.means.new_zeros(3))
             witnesses.add(camera, of_view.cpu(), surface_depth(render, "median"))
     progress(total, total)
-    kept = witnesses.in_contact()
-    return ContactFaces(candidates.surfels[kept], candidates.class_ids[kept])
+    in_contact = witnesses.in_contact()
+    return ContactFaces(candidates.surfels[in_contact], candidates.class_ids[in_contact])

@@ -1,11 +1,11 @@
-"""A texture fitted to photos: what a reader of the mesh draws shall be each photo's pixels, in the least squares.
+"""Fit a texture to photos: renders of the mesh shall equal the photos' pixels in the least squares.
 
-The mean of photos is blurred: each of its texels lies between the pixels of each photo, and a reader interpolates
-between texels once more. Pixels are linear in texels, so the texels that give the photos back are a sparse least
-squares problem, with the mean as what it starts from and is held to (in the manner of Goldluecke and Cremers,
+The mean of photos is blurred: each of its texels lies between the pixels of each photo, and renderers interpolate
+between texels once more. Pixels are linear in texels, so the texels that reproduce the photos solve a sparse least
+squares problem, which starts from the mean and is regularised towards it (after Goldluecke and Cremers,
 "Superresolution texture maps for multiview reconstruction", 2009).
 
-Determinism: the solver runs on one thread of BLAS, whose sums depend on how many it has.
+Determinism: the solver runs on one thread of BLAS, whose sums depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from beags_plugin.surfaces.baking import FLATTEST, well_inside
 from beags_plugin.surfaces.color import linear_from_srgb, srgb_from_linear
 from beags_plugin.surfaces.fusion import Mesh
 from beags_plugin.surfaces.item import Photo
-from beags_plugin.surfaces.surface import rays_through, surface_of
+from beags_plugin.surfaces.surface import corner_weights, rays_through, surface_of
 
-_RAYS = 0.25 * np.array([[1.0, 1.0], [3.0, 1.0], [1.0, 3.0], [3.0, 3.0]])  # in a pixel
-_MOST = 1_000_000  # pixels of all photos, each of which takes about 400 bytes; with more, the mean is sharp enough
-_HOLD = 0.2  # pull to the mean, in photos' pixels (chosen on tabletop 0 and room 0: notes/export.md)
-_STEPS = 20  # of the solver: it sharpens the longer the more, noise too
+_RAYS = 0.25 * np.array([[1.0, 1.0], [3.0, 1.0], [1.0, 3.0], [3.0, 3.0]])  # positions of rays in a pixel
+_MOST = 1_000_000  # pixels of all photos, about 400 bytes each; with more, the mean is sharp enough
+_HOLD = 0.2  # weight of the mean, in photos' pixels (chosen on tabletop 0 and room 0: notes/export.md)
+_STEPS = 20  # iterations of the solver; more sharpen more, and amplify noise
 
 
 def fitted(
@@ -38,11 +38,10 @@ def fitted(
     exposures: np.ndarray,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> np.ndarray:
-    """Return a mesh's picture [S, S, 3] uint8 sRGB, fitted to photos from one that is their mean.
+    """Return a mesh's texture [S, S, 3] uint8 sRGB, fitted to photos; image: the mean of the photos, as a texture.
 
-    exposures: [V, 3] of the photos, which are divided by them. A picture of more than a million pixels of photos stays
-    as it is. Texels that no photo shows stay as they are. progress:
-    receives (done, total) photos.
+    exposures: [V, 3] of the photos, which are divided by them. The image does not change where no photo shows a texel,
+    nor at all if more than a million pixels of photos show it. progress: receives (done, total) photos.
     """
     from scipy.sparse import csr_array
     from scipy.sparse.linalg import lsmr
@@ -51,22 +50,22 @@ def fitted(
     if not photos:
         return image
     caster, columns, shares, colors = surface_of(mesh), [], [], []
-    inside = [int(well_inside(photo).sum()) for photo in photos]
-    if sum(inside) > _MOST:  # some pixels alone would sharpen texels here and there
+    inside = sum(int(well_inside(photo).sum()) for photo in photos)
+    if inside > _MOST:  # A selection of pixels would sharpen the texture unevenly.
         return image
     for done, (photo, exposure) in enumerate(zip(photos, exposures, strict=True), start=1):
-        found = _pixels(photo, atlas, mesh, caster)
-        columns.append(found[0])
-        shares.append(found[1])
-        colors.append(srgb_from_linear(linear_from_srgb(found[2]) / exposure))
+        of_pixels, weights, pixels = _pixels(photo, atlas, mesh, caster)
+        columns.append(of_pixels)
+        shares.append(weights)
+        colors.append(srgb_from_linear(linear_from_srgb(pixels) / exposure))
         progress(done, len(photos))
     column, target = np.concatenate(columns), np.concatenate(colors)
     if not len(column):
         return image
-    shown = np.zeros(atlas.size**2, bool)
-    shown[column] = True
-    used = np.flatnonzero(shown)
-    rank = np.cumsum(shown, dtype=np.int32) - 1
+    visible = np.zeros(atlas.size**2, bool)
+    visible[column] = True
+    used = np.flatnonzero(visible)
+    rank = np.cumsum(visible, dtype=np.int32) - 1
     starts = np.arange(0, column.size + 1, column.shape[1])
     matrix: Any = csr_array(
         (np.concatenate(shares).reshape(-1), rank[column].reshape(-1), starts), shape=(len(column), len(used))
@@ -83,24 +82,23 @@ def fitted(
 
 
 def _pixels(photo: Photo, atlas: Atlas, mesh: Mesh, caster: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return which texels the pixels of a photo show, [M, 16] int32, their shares [M, 16] and the pixels [M, 3].
+    """Return the texels that the pixels of a photo show, [M, 16] int32, their shares [M, 16] and the pixels [M, 3].
 
-    Pixels well inside the item's mask, before which nothing of the scene stands, and that see the outside of the mesh,
-    not too flat, with all their rays. Texels count row by row.
+    Only pixels well inside the item's mask count, whose rays all meet the outside of the mesh at no flat angle, with
+    nothing of the scene in front of it. Texels are numbered row by row.
     """
     rows, cols = np.nonzero(well_inside(photo))
     xy = (np.stack([cols, rows], axis=1)[:, None] + _RAYS).reshape(-1, 2)
-    rays, ways = rays_through(mesh, photo.camera, xy)
+    rays, directions = rays_through(mesh, photo.camera, xy)
     hit = caster.cast_rays(rays)
     depth, normals = hit["t_hit"].numpy(), hit["primitive_normals"].numpy()
-    cosine = -np.einsum("pd,pd->p", normals, ways) / np.linalg.norm(ways, axis=1)
+    cosine = -np.einsum("pd,pd->p", normals, directions) / np.linalg.norm(directions, axis=1)
     scene = np.repeat(photo.depth().numpy()[rows, cols], len(_RAYS))
     good = np.isfinite(depth) & (cosine > FLATTEST) & ~((scene > 0) & (scene < (1.0 - TAU) * depth))
     whole = good.reshape(-1, len(_RAYS)).all(axis=1)
     rays_of = np.repeat(whole, len(_RAYS))
     face = hit["primitive_ids"].numpy()[rays_of].astype(np.int64)
-    u, v = hit["primitive_uvs"].numpy()[rays_of].astype(np.float64).T
-    uv = np.einsum("pc,pcd->pd", np.stack([1.0 - u - v, u, v], axis=1), atlas.uv[atlas.faces[face]])
+    uv = np.einsum("pc,pcd->pd", corner_weights(hit["primitive_uvs"].numpy()[rays_of]), atlas.uv[atlas.faces[face]])
     columns, shares = _between(uv, atlas.size)
     pixels = photo.image().double().numpy()[rows[whole], cols[whole]]
     shape = (len(pixels), 4 * len(_RAYS))
@@ -108,7 +106,7 @@ def _pixels(photo: Photo, atlas: Atlas, mesh: Mesh, caster: Any) -> tuple[np.nda
 
 
 def _between(uv: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the four texels [P, 4] int32 nearest to places in a picture and their shares [P, 4]."""
+    """Return the four texels [P, 4] int32 nearest to coordinates uv [P, 2], and their shares [P, 4]."""
     at = np.clip(uv * size - 0.5, 0.0, size - 1.0)
     first = np.minimum(np.floor(at).astype(np.int32), size - 2)
     x, y = (at - first).T

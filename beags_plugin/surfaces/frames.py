@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -14,16 +13,14 @@ from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.splat_io.frames import to_input_frame
 from beags_plugin.surfaces.item import Viewpoints
-from beags_plugin.system.errors import check_choice
 
-Placement = Literal["world", "object"]
-_BULK = 0.01  # share of the surfels at each side that do not count for the size of the item: some are strays
-_FENCE = 0.5  # how far beyond the bulk, as a share of its longest side, thin parts are looked for
+_BULK = 0.01  # share of the surfels at each side that the size of the item leaves out, because some are strays
+_FENCE = 0.5  # distance beyond the bulk, over its longest side, within which thin parts still count
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame of x, where the run's is x' = scale (R x + t).
+    """The frame of x, where the run's frame is x' = scale (R x + t).
 
     transform: [3, 4] float64, R | t, R a rotation; scale: positive.
     """
@@ -37,17 +34,17 @@ class Frame:
         return cls(torch.eye(4, dtype=torch.float64)[:3], 1.0)
 
     def centred(self, center: Tensor) -> Frame:
-        """Return this frame shifted: ``center`` [3], a point of it, becomes the origin."""
+        """Return this frame moved so that ``center`` [3], a point of it, becomes the origin."""
         rotation, shift = self.transform[:, :3], self.transform[:, 3:]
         return replace(self, transform=torch.cat([rotation, shift + rotation @ center.double()[:, None]], dim=1))
 
     def turned(self, rotation: Tensor) -> Frame:
-        """Return this frame turned: what is x here is ``rotation`` [3, 3] x there."""
+        """Return this frame turned: its x becomes ``rotation`` [3, 3] x."""
         turned, shift = self.transform[:, :3] @ rotation.double().T, self.transform[:, 3:]
         return replace(self, transform=torch.cat([turned, shift], dim=1))
 
     def scaled(self, factor: float) -> Frame:
-        """Return this frame in other units: what is x here is ``factor`` x there."""
+        """Return this frame in other units: its x becomes ``factor`` x."""
         transform = torch.cat([self.transform[:, :3], factor * self.transform[:, 3:]], dim=1)
         return Frame(transform, self.scale / factor)
 
@@ -83,19 +80,14 @@ class Frame:
         return matrix.tolist()
 
 
-def check_placement(placement: str) -> None:
-    """Raise ``UserError`` unless ``placement`` is one of ``Placement``."""
-    check_choice(placement, get_args(Placement), "frame")
-
-
 def bounding_box(surfels: Surfels) -> tuple[Tensor, Tensor]:
-    """Return the box about the ellipses of one standard deviation of N surfels, without strays far from the others.
+    """Return the box of N surfels' ellipses of one standard deviation, without strays far from the others.
 
-    It reaches at most half the bulk's longest side beyond the bulk, which is all but 1 % at each side. Surfels that are
-    not finite are left out; the box of none is the origin. Returns (low [3], high [3]) float64, in the surfels' frame.
+    It reaches at most half the bulk's longest side beyond the bulk, which leaves out 1 % at each side. Surfels that are
+    not finite do not count; without any, the box is the origin. Returns (low [3], high [3]) float64, in their frame.
     """
     axes = rotation_from_quat(surfels.quats.detach().double())[:, :, :2]
-    # a disc's reach along a world axis: the length of its two half-axes' components there
+    # A disc's reach along a world axis is the length of its two half axes' components there.
     reach = (axes * surfels.log_scales.detach().double().exp()[:, None, :]).square().sum(dim=2).sqrt()
     means = surfels.means.detach().double()
     low, high = (means - reach).cpu().numpy(), (means + reach).cpu().numpy()

@@ -1,6 +1,6 @@
 """A surface from an object's own depth: truncated signed distances of many views, averaged in a sparse voxel grid.
 
-The fusing is Open3D's (``VoxelBlockGrid``); what is here chooses the voxels and renders the views.
+Open3D's ``VoxelBlockGrid`` fuses; this module chooses the voxels and renders the views.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from beags_plugin.system.open3d_kernels import open3d_kernels
 BLOCK = 16
 """Voxels along a side of the blocks that Open3D allocates as a whole."""
 FEWEST, MOST, VOXELS_PER_PIXEL = 48, 128, 1.25
-"""Voxels along the longest side of an object where no number of them was asked for."""
+"""Voxels along the longest side of an object by default."""
 PIXELS_PER_VOXEL = 2
-"""Of the renders: discs smaller than a pixel are rendered a pixel wide, on slanted surfaces too near."""
+"""Resolution of the renders: discs smaller than a pixel are rendered a pixel wide, too near on slanted surfaces."""
 _VOXEL_BYTES = 20  # distance, weight and three colours, float32 each
-_STRIDE = 4  # pixels between those at which Open3D looks for blocks
-_SOLID = 0.5  # the median depth exists where more light than this is stopped
+_STRIDE = 4  # Open3D searches blocks at every fourth pixel.
+_SOLID = 0.5  # least alpha at which the median depth exists
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Mesh:
     """Triangles with a colour per vertex.
 
     vertices: [V, 3] float64, world units. faces: [F, 3] int64, counter-clockwise from outside.
-    colors: [V, 3] float32, 0..1, as in the photos (sRGB). voxel: side of the voxels it was made of, world units.
+    colors: [V, 3] float32, 0..1, as in the photos (sRGB). voxel: side of the voxels it was made from, world units.
     """
 
     vertices: np.ndarray
@@ -68,9 +68,9 @@ def _grid_mb(sides: Tensor, voxel: float, truncation: float) -> float:
 
 
 def suitable_resolution(surfels: Surfels, cameras: Sequence[Camera]) -> int:
-    """Return voxels along the longest side of a box: ``VOXELS_PER_PIXEL`` where a photo shows it largest.
+    """Return voxels along the longest side of a box: ``VOXELS_PER_PIXEL`` in the photo that shows it largest.
 
-    Finer ones would take time, and show nothing that a photo does. cameras: of the photos, not of close-ups.
+    Finer voxels would cost time and hold no more detail than the photos. cameras: those of the photos, not close-ups.
     """
     low, high = bounding_box(surfels)
     middle, side = (low + high)[None] / 2, float((high - low).max())
@@ -93,8 +93,8 @@ def fuse(
 
     surfels: N surfels, in the frame of the views. resolution: voxels along the longest side of their box; renders are
     close-ups of it, ``PIXELS_PER_VOXEL`` times as many pixels long. truncation: voxels on either side of the surface
-    that a view changes. memory_mb: bound of the grid, 10^6 bytes. on_render: takes the number of views done. Returns a
-    mesh, maybe of no face, whose order does not depend on the number of threads.
+    that a view changes. memory_mb: bound of the grid, 10^6 bytes. on_render: receives the number of views done. Returns
+    a mesh, perhaps without faces, whose order does not depend on the number of threads.
     """
     low, high = bounding_box(surfels)
     if not bool((high > low).any()):
@@ -108,7 +108,7 @@ def fuse(
         if bool((depth > 0).any()):
             seen |= _integrate(grid, depth / voxel, color, _in_voxels(close, low, voxel), truncation)
         on_render(done)
-    if not seen:  # Open3D ends with an error
+    if not seen:  # Open3D raises an error for an empty grid.
         return nothing
     weight = min(min_views, len(views.cameras)) - 0.5
     mesh = grid.extract_triangle_mesh(weight_threshold=weight)
@@ -128,27 +128,27 @@ def _new_grid() -> Any:
         attr_names=("tsdf", "weight", "color"),
         attr_dtypes=(core.float32, core.float32, core.float32),
         attr_channels=((1), (1), (3)),
-        voxel_size=1.0,  # so that the scale of a scene changes nothing
+        voxel_size=1.0,  # The scale of a scene then changes nothing.
         block_resolution=BLOCK,
-        block_count=256,  # it grows
+        block_count=256,  # The grid grows.
         device=core.Device("CPU:0"),
     )
 
 
 def _draw(surfels: Surfels, camera: Camera, views: Viewpoints, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Render median depth [H, W], 0 where nothing solid is seen or outside the box low, high, and colour [H, W, 3]."""
+    """Render median depth [H, W], 0 where alpha is low or outside the box low, high, and colour [H, W, 3]."""
     black = torch.zeros(3, dtype=surfels.means.dtype)
-    drawn = views.rasterizer.rasterize(surfel_inputs(surfels, camera), camera, views.settings, black)
-    assert drawn.median_depth is not None  # geometry is on unless the settings turn it off
-    points = lift(drawn.median_depth, camera)
-    inside = ((points >= low) & (points <= high)).all(dim=-1) & (drawn.alpha > _SOLID)
+    render = views.rasterizer.rasterize(surfel_inputs(surfels, camera), camera, views.settings, black)
+    own_depth = surface_depth(render, "median")
+    points = lift(own_depth, camera)
+    inside = ((points >= low) & (points <= high)).all(dim=-1) & (render.alpha > _SOLID)
     if views.scene is not None:
         whole = views.rasterizer.rasterize(geometry_inputs(views.scene), camera, views.settings, black)
-        shown = surface_depth(whole, "median")
-        inside &= (shown == 0) | (drawn.median_depth <= (1.0 + TAU) * shown)
-    depth = torch.where(inside, drawn.median_depth, 0.0)
-    # without the black that shines through
-    return depth, (drawn.color / drawn.alpha.clamp(min=_SOLID)[..., None]).clamp(0.0, 1.0)
+        scene_depth = surface_depth(whole, "median")
+        inside &= (scene_depth == 0) | (own_depth <= (1.0 + TAU) * scene_depth)
+    depth = torch.where(inside, own_depth, 0.0)
+    # Dividing by alpha removes the black background.
+    return depth, (render.color / render.alpha.clamp(min=_SOLID)[..., None]).clamp(0.0, 1.0)
 
 
 def _in_voxels(camera: Camera, low: Tensor, voxel: float) -> tuple[np.ndarray, np.ndarray]:
@@ -170,24 +170,24 @@ def _integrate(grid: Any, depth: Tensor, color: Tensor, pose: tuple[np.ndarray, 
     depth_image = open3d.t.geometry.Image(open3d.core.Tensor(depth.float().contiguous().numpy()))
     color_image = open3d.t.geometry.Image(open3d.core.Tensor(color.float().contiguous().numpy()))
     limit = float(depth.max()) + 1.0
-    rows, columns = (_STRIDE * (side // _STRIDE) for side in depth.shape)  # Open3D looks at no pixel beyond
+    rows, columns = (_STRIDE * (side // _STRIDE) for side in depth.shape)  # Open3D reads no pixel beyond these.
     if not bool((depth[:rows:_STRIDE, :columns:_STRIDE] > 0).any()):
-        return False  # a few pixels between those at which Open3D looks for blocks: it would end with an error
+        return False  # Open3D would find no block in these few pixels, and raise an error.
     blocks = grid.compute_unique_block_coordinates(depth_image, K, viewmat, 1.0, limit, float(truncation))
     grid.integrate(blocks, depth_image, color_image, K, viewmat, 1.0, limit, float(truncation))
     return True
 
 
 def sorted_mesh(mesh: Mesh) -> Mesh:
-    """Return the mesh with vertices in the order of their places and faces in that of their vertices.
+    """Return the mesh with vertices in the order of their positions and faces in that of their vertices.
 
-    Determinism: Open3D's threads number both as they come.
+    Determinism: Open3D's threads number both in any order.
     """
     order = np.lexsort(mesh.vertices.T[::-1])
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))
     faces = rank[mesh.faces]
-    first = faces.argmin(axis=1)  # turned so that the lowest comes first, which keeps the side
+    first = faces.argmin(axis=1)  # Rotating each face to begin with its lowest vertex keeps its side.
     faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
     return Mesh(mesh.vertices[order], faces[np.lexsort(faces.T[::-1])], mesh.colors[order], mesh.voxel)
 
@@ -204,10 +204,10 @@ def without_small_parts(mesh: Mesh, share: float) -> Mesh:
     count = len(mesh.vertices)
     _, part = connected_components(coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(count, count)), False)
     sizes = np.bincount(part[mesh.faces[:, 0]], minlength=part.max() + 1)
-    kept = (sizes >= max(1.0, share * sizes.max()))[part]  # a vertex without faces goes too
-    number = np.cumsum(kept) - 1
-    faces = mesh.faces[kept[mesh.faces[:, 0]]]
-    return Mesh(mesh.vertices[kept], number[faces], mesh.colors[kept], mesh.voxel)
+    large = (sizes >= max(1.0, share * sizes.max()))[part]  # Vertices without faces are removed too.
+    number = np.cumsum(large) - 1
+    faces = mesh.faces[large[mesh.faces[:, 0]]]
+    return Mesh(mesh.vertices[large], number[faces], mesh.colors[large], mesh.voxel)
 
 
 def decimated(mesh: Mesh, most: int) -> Mesh:
@@ -216,13 +216,13 @@ def decimated(mesh: Mesh, most: int) -> Mesh:
         return mesh
     open3d = open3d_kernels()
 
-    origin = mesh.vertices.mean(axis=0)  # quadrics lose digits far from the origin
+    origin = mesh.vertices.mean(axis=0)  # Quadrics lose digits far from the origin.
     full = open3d.geometry.TriangleMesh(
         open3d.utility.Vector3dVector((mesh.vertices - origin) / mesh.voxel),
         open3d.utility.Vector3iVector(mesh.faces.astype(np.int32)),
     )
     full.vertex_colors = open3d.utility.Vector3dVector(mesh.colors.astype(np.float64))
-    few = full.simplify_quadric_decimation(most)  # of Open3D's two the one that keeps colours
+    few = full.simplify_quadric_decimation(most)  # Only this one of Open3D's two functions keeps colours.
     few.remove_unreferenced_vertices()
     vertices = np.asarray(few.vertices) * mesh.voxel + origin
     colors = np.asarray(few.vertex_colors, np.float32)

@@ -1,4 +1,4 @@
-"""The plane that an object stands on, by what the scene shows around its foot."""
+"""Find the plane that an object stands on, from points of the scene around its foot."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-_REACH = 0.5  # of the object's size: how far around its foot points count
-_BAND = (0.5, 0.25, 0.1)  # of the size: how far from the foot points count, up or down; each round knows up better
-_FLAT = 0.01  # of the size: distance from the plane up to which a point lies on it
-_STEEPEST = 1.5  # rise of the plane against the former up direction: 56 degrees
-_FEWEST, _SHARE = 50, 0.2  # points on the plane, at least; and of those around the foot
-_SUNK = 0.05  # of the size: how far below the plane nine tenths of the object may reach at most
-_APART = 0.1  # of the size: how far the object's foot may be from the plane
+# Lengths are relative to the object's size.
+_REACH = 0.5  # horizontal distance from the object within which points count
+_BAND = (0.5, 0.25, 0.1)  # vertical distance from its foot within which points count, by round, as up becomes known
+_FLAT = 0.01  # distance from the plane within which a point lies on it
+_STEEPEST = 1.5  # largest slope of the plane against the former up direction: 56 degrees
+_FEWEST, _SHARE = 50, 0.2  # least number of points on the plane, and least share of the points around the foot
+_SUNK = 0.05  # largest depth below the plane of the object's lowest tenth
+_APART = 0.1  # largest distance of the object's foot from the plane
 
 
 @dataclass(frozen=True)
@@ -27,10 +28,10 @@ class Plane:
 
 
 def standing_plane(around: Tensor, own: Tensor, up: Tensor) -> Plane | None:
-    """Return the plane that an object stands on; None if no plane is seen around its foot, or not under it.
+    """Return the plane that an object stands on; None if there is no plane around its foot, or it is not under it.
 
-    around: [P, 3] float64, points of the scene without the object. own: [Q, 3] points of the object. up: [3] a guess,
-    up to 50 degrees off.
+    around: [P, 3] float64, points of the scene without the object. own: [Q, 3] points of the object. up: [3], a guess
+    that may be 50 degrees off.
     """
     if len(own) < 3:
         return None
@@ -64,7 +65,7 @@ def _plane_near(around: Tensor, own: Tensor, up: Tensor, band: float) -> Plane |
     )  # fmt: skip
     try:
         fit.fit(ring[:, :2], ring[:, 2])
-    except ValueError:  # every sample was too steep
+    except ValueError:  # Every sample was too steep.
         return None
     if fit.inlier_mask_.sum() < max(_FEWEST, _SHARE * len(ring)):
         return None
@@ -76,7 +77,7 @@ def _plane_near(around: Tensor, own: Tensor, up: Tensor, band: float) -> Plane |
 
 
 def _size(points: Tensor) -> float:
-    """Return the longest side of the box about all but a few of the points."""
+    """Return the longest side of the box of all but a few of the points."""
     ends = torch.stack([points.quantile(share, dim=0) for share in (0.01, 0.99)])
     return max(float((ends[1] - ends[0]).max()), 1e-12)
 
@@ -86,6 +87,6 @@ def turn_to_z(up: Tensor) -> Tensor:
     x, y, z = (up.double() / up.double().norm()).tolist()
     if z < -1 + 1e-12:
         return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
-    # Rodrigues' formula about up x z = (y, -x, 0), of length sin, for the angle of cosine z
+    # Rodrigues' formula turns about up x z = (y, -x, 0), whose length is the sine, by the angle whose cosine is z.
     cross = torch.tensor([[0, 0, -x], [0, 0, -y], [x, y, 0]], dtype=torch.float64)
     return torch.eye(3, dtype=torch.float64) + cross + cross @ cross / (1 + z)

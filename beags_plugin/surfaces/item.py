@@ -1,4 +1,4 @@
-"""What is exported or made a surface of: an object, the views of the training photos, and the photos themselves."""
+"""An item to export or to make a surface of: an object, the training views, and the photos."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from beags_plugin.system.errors import UserError
 
 
 class NothingToExport(UserError):
-    """An item has nothing of what a format holds; with --all the other items are written all the same."""
+    """An item holds nothing that a format can store; with --all, the other items are written all the same."""
 
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """The training cameras, and the rasterizer for views from there; all in the frame of the file.
+    """The training cameras, and the rasterizer of their views; all in the frame of the file.
 
-    scene: the whole scene, what an item is a part of; no view sees the item where the rest hides it. None if unknown.
+    scene: the whole scene with the item, whose other parts hide the item in the views; None if unknown.
     """
 
     cameras: Sequence[Camera]
@@ -33,12 +33,12 @@ class Viewpoints:
 
 @dataclass(frozen=True)
 class Photo:
-    """A training photo and what it shows of an item; what returns tensors may read files.
+    """A training photo and its mask of an item; the functions may read files.
 
     camera: in the frame of the file. image: [H, W, 3] float32 in 0..1, sRGB. own: [H, W] bool, the item's mask.
-    depth: [H, W] of the whole scene, in the file's units along z, 0 where nothing is. edge: pixels from the mask's
-    border within which it may not be right. sharper: the same part of the photo with more pixels, nearer to those of
-    its file; None where there are no more.
+    depth: [H, W] of the whole scene, in the file's units along z, 0 where it is empty. edge: pixels from the mask's
+    border within which the mask may be wrong. sharper: the same part of the photo in a higher resolution; None where
+    the photo has none.
     """
 
     camera: Camera
@@ -53,15 +53,16 @@ class Photo:
 class ExportItem:
     """An object or the background to export, in the frame of the file.
 
-    name: as the user calls it. surfels: N surfels. class_ids: [N] int32, phi.
-    views: of the training photos; None unless an exporter ``needs_views``.
-    photos: of the item; None unless an exporter ``needs_photos``, or where there are none, as ``no_photos`` says.
-    in_metres: whether the frame's unit is a metre; else it is unknown.
+    name: the user's name of it. surfels: N surfels. class_ids: [N] int32, phi.
+    views: those of the training photos; None unless an exporter ``needs_views``.
+    photos: those of the item; None unless an exporter ``needs_photos``, or if there are none, for the reason
+        ``no_photos``.
+    in_metres: whether the frame's unit is the metre; otherwise it is unknown.
     close: whether meshes shall be closed where no photo shows the item.
-    invented: [N] bool, surfels that close it there; None where it was not asked to be closed.
-    class_names: of the ids among ``class_ids``, for files that hold several objects.
-    shared: what exporters of one item keep for each other, such as the mesh that two file types hold.
-    on_render: is called, by an exporter that ``needs_views``, with the number of views rendered so far.
+    invented: [N] bool, surfels that close it there; None if it was not to be closed.
+    class_names: the names of ``class_ids``, for files that hold several objects.
+    shared: results that exporters of one item share, such as the mesh of two file types.
+    on_render: an exporter that ``needs_views`` calls it with the number of views rendered so far.
     """
 
     name: str

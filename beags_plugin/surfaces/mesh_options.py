@@ -1,4 +1,4 @@
-"""Options of the mesh exporters, on their own so that the command line can show them without loading anything."""
+"""Options of the mesh exporters, in a module of their own that the command line can import quickly."""
 
 from __future__ import annotations
 
@@ -8,32 +8,32 @@ from typing import Literal
 
 from beags_plugin.system.errors import UserError, check_choice
 
-MOST_VOXELS = 4096  # along a side; memory_mb bounds their number besides
+MOST_VOXELS = 4096  # voxels along a side; memory_mb also bounds their number
 LARGEST_TEXTURE = 8192  # texels along a side
 TEXTURES = ("photos", "none")
 
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """Options of making a mesh from the depth that the training views see."""
+    """Options of a mesh from the depth of the training views."""
 
     resolution: int = 0
-    """Meshes: voxels along the object's longest side; 0 chooses up to 128, by how many pixels photos have there."""
+    """Meshes: voxels along the object's longest side; 0 chooses up to 128, by the object's size in the photos."""
     truncation: float = 6.0
-    """Meshes: voxels on either side of a surface that are averaged; more bridges depths that disagree, but the two
-    sides of a wall thinner than twice as many draw together."""
+    """Meshes: voxels on either side of a surface that are averaged. A larger value merges depths that disagree, but
+    moves the sides of a wall thinner than twice the value towards each other."""
     memory_mb: float = 500.0
-    """Meshes: bound of the voxel grid in MB; voxels grow to keep it."""
+    """Meshes: largest size of the voxel grid in MB; voxels grow to stay below it."""
     min_views: int = 3
-    """Meshes: views that must show a surface (all, if there are fewer)."""
+    """Meshes: least number of views that show a surface (all, if there are fewer)."""
     smallest_part: float = 0.01
     """Meshes: loose parts with fewer triangles than this share of the largest part's are left out."""
     triangles: int = 0
-    """Meshes: most triangles; 0 stands for 20 for each Gaussian, but at least 1,000 and at most 20,000."""
+    """Meshes: largest number of triangles; 0 means 20 per Gaussian, at least 1,000 and at most 20,000."""
     texture: Literal["photos", "none"] = "photos"
-    """Colours of a .glb: a texture from the photos, or none: those of the splats at the vertices."""
+    """Colours of a .glb: a texture from the photos, or none, which uses the splats' colours at the vertices."""
     texture_size: int = 0
-    """Texels along a side of the texture; 0 chooses what suits the photos."""
+    """Texels along a side of the texture; 0 chooses a size that suits the photos."""
 
     def __post_init__(self) -> None:
         if self.resolution != 0 and not 8 <= self.resolution <= MOST_VOXELS:

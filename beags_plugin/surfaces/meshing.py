@@ -1,4 +1,4 @@
-"""Meshes of items: the surface that the views see, placed by the photos, closed where asked."""
+"""Meshes of items: the surface that the views see, aligned with the photos, and closed on demand."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 
 from beags_plugin.surfaces.closing import Closed, closed
-from beags_plugin.surfaces.fusion import Mesh, fuse, suitable_resolution, without_small_parts
+from beags_plugin.surfaces.fusion import Mesh, decimated, fuse, suitable_resolution, without_small_parts
 from beags_plugin.surfaces.item import ExportItem, NothingToExport
 from beags_plugin.surfaces.mesh_options import MeshOptions
 from beags_plugin.surfaces.surface import area_vectors
-from beags_plugin.surfaces.surface_alignment import Placed, placed
+from beags_plugin.surfaces.surface_alignment import placed
 from beags_plugin.system.open3d_kernels import open3d_kernels
 from beags_plugin.system.progress import progress_bar
 
 
 def seen_surface(item: ExportItem, options: MeshOptions) -> Mesh:
-    """Return the surface that the training views see of an item rendered alone, maybe of no face; made once."""
+    """Return the surface that the training views see of an item rendered alone, perhaps without faces; made once."""
     if item.views is None:
         raise ValueError("a surface needs the views of the training photos")
     resolution = options.resolution or suitable_resolution(item.surfels, item.views.cameras)
@@ -29,10 +29,10 @@ def seen_surface(item: ExportItem, options: MeshOptions) -> Mesh:
     return without_small_parts(fused, options.smallest_part)
 
 
-def placed_surface(item: ExportItem, options: MeshOptions) -> Placed:
-    """Return the seen surface where the photos place it, if there are any; raises ``NothingToExport`` without a face.
+def placed_surface(item: ExportItem, options: MeshOptions) -> tuple[Mesh, float]:
+    """Return the surface that the views see, aligned with the photos, if any, and the mean move in pixels.
 
-    It is made once for each set of options.
+    It is made once for each set of options. Raises ``NothingToExport`` for a surface without faces.
     """
     mesh = seen_surface(item, options)
     if not len(mesh.faces):
@@ -41,17 +41,17 @@ def placed_surface(item: ExportItem, options: MeshOptions) -> Placed:
             "lower --min-views, or export it as splats."
         )
     if not item.photos:
-        return Placed(mesh, 0.0)
+        return mesh, 0.0
     chosen = options.resolution, options.truncation, options.memory_mb, options.min_views, options.smallest_part
-    found = item.shared.get(("placed", chosen))
-    if found is None:
+    aligned = item.shared.get(("placed", chosen))
+    if aligned is None:
         with progress_bar("Placing the surface", passing=True) as progress:
-            found = item.shared["placed", chosen] = placed(mesh, item.photos, progress)
-    return found
+            aligned = item.shared["placed", chosen] = placed(mesh, item.photos, progress)
+    return aligned
 
 
 def closed_surface(item: ExportItem, mesh: Mesh) -> Closed:
-    """Return a surface of an item closed; raises ``NothingToExport`` if it encloses nothing."""
+    """Return the closed surface of an item; raises ``NothingToExport`` if it encloses nothing."""
     solid = closed(mesh)
     if solid is None:
         raise NothingToExport(
@@ -61,11 +61,18 @@ def closed_surface(item: ExportItem, mesh: Mesh) -> Closed:
     return solid
 
 
+def closed_mesh(item: ExportItem, mesh: Mesh, smallest_part: float, most: int) -> Closed:
+    """Return ``closed_surface`` with at most ``most`` triangles, without parts of less than ``smallest_part``."""
+    solid = closed_surface(item, mesh)
+    few = decimated(without_small_parts(solid.mesh, smallest_part), most)
+    return Closed(few, solid.invented_at(few.vertices))
+
+
 @dataclass(frozen=True)
 class MadeMesh:
-    """A mesh; pixels: that photos moved its places outwards, in the mean, 0 without photos.
+    """A mesh; pixels: the mean distance that photos moved it outwards, 0 without photos.
 
-    invented: [V] bool, vertices where no view showed a surface, None of a mesh that was not closed.
+    invented: [V] bool, vertices where no view showed a surface; None for a mesh that was not closed.
     """
 
     mesh: Mesh
@@ -73,21 +80,22 @@ class MadeMesh:
     invented: np.ndarray | None = None
 
     def facts(self) -> dict[str, Any]:
-        """Return the manifest's entries about it; closed_share: of its area, where all corners are invented."""
-        found = {"vertices": len(self.mesh.vertices), "triangles": len(self.mesh.faces), "voxel": self.mesh.voxel}
+        """Return the manifest's entries about it; closed_share: share of its area whose vertices are all invented."""
+        mesh = self.mesh
+        facts: dict[str, Any] = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces), "voxel": mesh.voxel}
         if self.pixels:
-            found["moved_pixels"] = round(self.pixels, 3)
+            facts["moved_pixels"] = round(self.pixels, 3)
         if self.invented is None:
-            return found
-        areas = np.linalg.norm(area_vectors(self.mesh), axis=1)
-        share = areas[self.invented[self.mesh.faces].all(axis=1)].sum() / max(areas.sum(), 1e-300)
-        return found | {"closed_share": round(float(share), 4)}
+            return facts
+        areas = np.linalg.norm(area_vectors(mesh), axis=1)
+        share = areas[self.invented[mesh.faces].all(axis=1)].sum() / max(areas.sum(), 1e-300)
+        return facts | {"closed_share": round(float(share), 4)}
 
 
 def open3d_missing() -> str | None:
     """Return None if Open3D can be loaded, else one sentence: why not and what to install."""
     try:
         open3d_kernels()
-    except (ImportError, OSError) as error:  # a system library that it needs may be missing
+    except (ImportError, OSError) as error:  # A system library may be missing.
         return f"Open3D cannot be loaded ({error}); pip install open3d, which needs libX11 and libGL."
     return None

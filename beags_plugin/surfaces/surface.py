@@ -12,13 +12,13 @@ from beags_plugin.system.open3d_kernels import open3d_kernels
 
 
 def area_vectors(mesh: Mesh) -> np.ndarray:
-    """Return [F, 3] the outward normals of faces, as long as their areas."""
+    """Return the outward normals of faces, [F, 3], as long as their areas."""
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
     return np.cross(b - a, c - a) / 2
 
 
 def vertex_normals(mesh: Mesh) -> np.ndarray:
-    """Return [V, 3] float64 unit normals, of faces by their areas; z where a vertex has none."""
+    """Return [V, 3] float64 unit normals, the faces' weighted by area; z for a vertex without faces."""
     normals = np.zeros_like(mesh.vertices)
     areas = area_vectors(mesh)
     for axis in range(3):
@@ -44,11 +44,17 @@ def in_voxels(mesh: Mesh, points: np.ndarray) -> Any:
     return open3d.core.Tensor(((points - mesh.vertices[0]) / mesh.voxel).astype(np.float32))
 
 
+def corner_weights(uvs: np.ndarray) -> np.ndarray:
+    """Return the weights [P, 3] float64 of a face's corners at Open3D's coordinates ``primitive_uvs`` [P, 2]."""
+    u, v = uvs.astype(np.float64).T
+    return np.stack([1.0 - u - v, u, v], axis=1)
+
+
 def rays_through(mesh: Mesh, camera: Camera, xy: np.ndarray) -> tuple[Any, np.ndarray]:
     """Return Open3D's tensor of rays [P, 6] through pixel coordinates [P, 2], in the frame of ``surface_of``.
 
-    Their parameter is the depth along the camera's z, in the mesh's unit. The second are their ways [P, 3] in a unit of
-    depth.
+    Their parameter is the depth along the camera's z, in the mesh's unit. Returns also their directions [P, 3] per unit
+    of depth.
     """
     open3d = open3d_kernels()
 

@@ -1,60 +1,51 @@
-"""A surface moved along its normals to where the photos agree on its colours.
+"""Move a surface along its normals to where the photos agree on its colours.
 
-The depth of trained splats lies behind what they show, by up to a pixel: their pictures are right in each view, and a
-splat drawn at least a pixel wide keeps its outline where its middle lies further in. Where a surface lies, the photos
-that see a place have one colour for it; a pixel in front or behind they differ, wherever the surface has a texture. But
-highlights of something glossy lie behind its surface, as seen in a mirror: so a surface is only moved where its outline
-still fits the masks.
+The depth of trained splats lies up to a pixel behind the true surface: renders are right all the same, because splats
+are rendered at least a pixel wide. On the true surface, photos agree on the colour of a place; a pixel in front or
+behind they differ, wherever the surface has a texture. Highlights of glossy objects, however, lie behind the surface,
+as mirror images do. A surface is therefore only moved if its outline still fits the masks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 
 from beags_plugin.core.lifting import TAU, project
-from beags_plugin.surfaces.baking import Places, Shown, exposures_of, interpolated, places_seen
+from beags_plugin.surfaces.baking import Observations, Places, exposures_of, interpolated, places_seen
 from beags_plugin.surfaces.color import linear_from_srgb
 from beags_plugin.surfaces.fusion import Mesh
 from beags_plugin.surfaces.item import Photo
 from beags_plugin.surfaces.surface import rays_through, surface_of, vertex_normals
 
-_SAMPLES = 4000  # vertices that are looked at
+_SAMPLES = 4000  # vertices that are measured
 _STEP = 0.25  # pixels
-_STEPS = _STEP * np.arange(-6, 7)  # that they are moved outwards
-_ROUNDS = 2  # the second sees normals and what hides what as the first has left them
-_FEWEST = 3  # photos that must see a place
+_STEPS = _STEP * np.arange(-6, 7)  # outward moves that are compared, pixels
+_ROUNDS = 2  # the second round has better normals and occlusions
+_FEWEST = 3  # least number of photos that see a place
 _NEIGHBOURS = 24  # places that are moved alike
-_REACH = 10.0  # voxels apart, or normals 60 degrees apart, is far for neighbours
-_PULL = 0.1  # of all places' mean agreement, beside a place's own
-_LOST = 0.002  # IoU with the masks that moving may cost
-_PIXELS = 50_000  # of a photo that outlines are compared at, about
-_NOISE = 1e-5  # disagreement a squared pixel, that places of one colour stay where they are
-
-
-@dataclass(frozen=True)
-class Placed:
-    """A mesh, and by how many pixels its places were moved, in the mean."""
-
-    mesh: Mesh
-    pixels: float
+_REACH = 10.0  # distance in voxels that counts as much as normals 60 degrees apart
+_PULL = 0.1  # weight of all places' mean disagreement beside a place's own
+_LOST = 0.002  # IoU with the masks that a move may cost
+_PIXELS = 50_000  # approximate number of pixels of a photo at which outlines are compared
+_NOISE = 1e-5  # disagreement per squared pixel, which keeps places of one colour where they are
 
 
 def placed(
     mesh: Mesh, photos: Sequence[Photo], progress: Callable[[int, int], None] = lambda done, total: None
-) -> Placed:
-    """Return a mesh of at least one face, moved to where photos agree; as it is where too few of them see it.
+) -> tuple[Mesh, float]:
+    """Return a mesh of at least one face, moved to where photos agree, and the mean move in pixels.
 
-    A round that takes its outline away from the photos' masks does not count. progress: receives (done, total) photos,
-    each of which is looked at once, and then three times in a round.
+    The mesh is unchanged if too few photos see it. A round that moves its outline away from the photos' masks is
+    dropped. progress: receives (done, total) photos, each of which is read once, and then three times in a round.
     """
     count = len(photos)
     if count < _FEWEST:
-        return Placed(mesh, 0.0)
+        return mesh, 0.0
     moved, total = 0.0, (1 + 3 * _ROUNDS) * count
 
     def passed(before: int) -> Callable[[int], None]:
@@ -63,18 +54,18 @@ def placed(
     least = outline_iou(mesh, photos, passed(0)) - _LOST
     for turn in range(_ROUNDS):
         first = (1 + 3 * turn) * count
-        found = _moved(mesh, photos, passed(first))
-        if found is None or outline_iou(found[0], photos, passed(first + 2 * count)) < least:
+        result = _moved(mesh, photos, passed(first))
+        if result is None or outline_iou(result[0], photos, passed(first + 2 * count)) < least:
             break
-        mesh, pixels = found
+        mesh, pixels = result
         moved += pixels
-    return Placed(mesh, moved)
+    return mesh, moved
 
 
 def outline_iou(mesh: Mesh, photos: Sequence[Photo], progress: Callable[[int], None] = lambda done: None) -> float:
-    """Return the IoU of a mesh's outline with the masks of photos, over all of them; what hides the mesh is left out.
+    """Return the IoU of a mesh's outline with the masks of all photos, without pixels where something hides the mesh.
 
-    1 where neither shows anything. progress: receives how many photos are done.
+    It is 1 if both are empty. progress: receives the number of photos done.
     """
     caster, both, either = surface_of(mesh), 0, 0
     for done, photo in enumerate(photos, start=1):
@@ -83,10 +74,10 @@ def outline_iou(mesh: Mesh, photos: Sequence[Photo], progress: Callable[[int], N
         rows, columns = (each.reshape(-1) for each in np.mgrid[: camera.height : step, : camera.width : step])
         rays, _ = rays_through(mesh, camera, np.stack([columns, rows], axis=1) + 0.5)
         hit = caster.cast_rays(rays)["t_hit"].numpy()
-        mine, scene = own[rows, columns], depth[rows, columns]
-        hidden = ~mine & (scene > 0) & (scene < (1.0 - TAU) * hit)
-        shown = np.isfinite(hit) & ~hidden
-        both, either = both + int((shown & mine).sum()), either + int((shown | mine).sum())
+        mask, scene = own[rows, columns], depth[rows, columns]
+        hidden = ~mask & (scene > 0) & (scene < (1.0 - TAU) * hit)
+        outline = np.isfinite(hit) & ~hidden
+        both, either = both + int((outline & mask).sum()), either + int((outline | mask).sum())
         progress(done)
     return both / either if either else 1.0
 
@@ -94,8 +85,6 @@ def outline_iou(mesh: Mesh, photos: Sequence[Photo], progress: Callable[[int], N
 def _moved(mesh: Mesh, photos: Sequence[Photo], progress: Callable[[int], None]) -> tuple[Mesh, float] | None:
     from scipy.spatial import KDTree
 
-    if len(photos) < _FEWEST:
-        return None
     chosen = np.sort(np.random.default_rng(0).permutation(len(mesh.vertices))[:_SAMPLES])
     normals = vertex_normals(mesh)
     tree = KDTree(_spots(mesh, normals)[chosen])
@@ -129,12 +118,12 @@ def _moved(mesh: Mesh, photos: Sequence[Photo], progress: Callable[[int], None])
 
 
 def _spots(mesh: Mesh, normals: np.ndarray) -> np.ndarray:
-    """Return [V, 6], in which places are near each other that are so on one side of the surface."""
+    """Return [V, 6], positions and normals: near each other for neighbours on one side of the surface."""
     return np.concatenate([(mesh.vertices - mesh.vertices[0]) / (_REACH * mesh.voxel), normals], axis=1)
 
 
 def _pixels(points: np.ndarray, photos: Sequence[Photo]) -> np.ndarray:
-    """Return [P] how large a pixel is at points [P, 3], the median over the photos."""
+    """Return the size of a pixel at points [P, 3], [P]: the median over the photos."""
     sizes = []
     for photo in photos:
         z = project(torch.from_numpy(points), photo.camera.to(torch.float64))[1].numpy()
@@ -148,31 +137,31 @@ def _pixels(points: np.ndarray, photos: Sequence[Photo]) -> np.ndarray:
 def _disagreement(
     places: Places, pixel: np.ndarray, mesh: Mesh, photos: Sequence[Photo], progress: Callable[[int], None]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights [P], 0 where fewer than three photos see a place, and how much the photos that do differ there.
+    """Return weights [P], 0 where fewer than three photos see a place, and the photos' disagreement [P, K].
 
-    The second is [P, K], the variance of the root of light at places moved by each of the steps.
+    The disagreement is the variance of the square root of light at places moved by each of the K steps.
     """
     caster = surface_of(mesh)
-    shown: list[Shown] = []
+    observations: list[Observations] = []
 
-    def looked_at() -> Iterator[Shown]:
+    def observed() -> Iterator[Observations]:
         for photo in photos:
-            shown.append(places_seen(places, mesh, caster, photo))
-            yield shown[-1]
+            observations.append(places_seen(places, mesh, caster, photo))
+            yield observations[-1]
 
-    exposures = exposures_of(len(places.points), len(photos), looked_at(), progress)
+    exposures = exposures_of(len(places.points), len(photos), observed(), progress)
     count, steps = len(places.points), len(_STEPS)
     weight, seen = np.zeros(count), np.zeros(count, np.int64)
     first, second = np.zeros((count, steps, 3)), np.zeros((count, steps, 3))
     for view, (photo, exposure) in enumerate(zip(photos, exposures, strict=True)):
-        index, _, sharp = shown[view]
+        index, _, sharp = observations[view]
         sharp = np.minimum(sharp, 1.0) ** (1 / 3)
         weight[index] += sharp
         seen[index] += 1
         camera, image = photo.camera.to(torch.float64), photo.image()
         by = (pixel[index, None] * _STEPS)[..., None]
-        there = (places.points[index, None] + by * places.normals[index, None]).reshape(-1, 3)
-        xy = project(torch.from_numpy(there), camera)[0].numpy()
+        moved = (places.points[index, None] + by * places.normals[index, None]).reshape(-1, 3)
+        xy = project(torch.from_numpy(moved), camera)[0].numpy()
         root = np.sqrt(linear_from_srgb(interpolated(image, xy)) / exposure).reshape(-1, steps, 3)
         first[index] += sharp[:, None, None] * root
         second[index] += sharp[:, None, None] * root**2
@@ -183,7 +172,7 @@ def _disagreement(
 
 
 def _lowest(costs: np.ndarray) -> np.ndarray:
-    """Return [P] the steps at which costs [P, K] are lowest, between steps by a parabola."""
+    """Return the moves [P], pixels, at which costs [P, K] are lowest; a parabola interpolates between steps."""
     at = costs.argmin(axis=1)
     inner = np.clip(at, 1, costs.shape[1] - 2)
     rows = np.arange(len(costs))

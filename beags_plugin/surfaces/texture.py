@@ -18,17 +18,17 @@ from beags_plugin.surfaces.item import Photo
 from beags_plugin.surfaces.surface import area_vectors, vertex_normals
 from beags_plugin.system.progress import progress_bar
 
-LARGEST = 2048  # side of textures whose size is chosen here
-_FINE = 1.5  # texels for a pixel of the photos along a side
-_NEAREST = 0.75  # share of the photos that may be farther away than the one that decides
+LARGEST = 2048  # largest side of a texture whose size is chosen here
+_FINE = 1.5  # texels per pixel of the photos, along a side
+_NEAREST = 0.75  # share of the photos that may be farther away than the photo that decides
 
 
 @dataclass(frozen=True)
 class Texture:
-    """A mesh's charts and their picture.
+    """A mesh's charts and their image.
 
-    image: [S, S, 3] uint8, sRGB. from_photos: share of its texels that a photo shows. exposures: [V, 3] of the photos,
-    as they were evened out.
+    image: [S, S, 3] uint8, sRGB. from_photos: share of its texels that a photo shows. exposures: [V, 3], by which the
+    photos were divided.
     """
 
     atlas: Atlas
@@ -48,17 +48,17 @@ def textured(mesh: Mesh, photos: Sequence[Photo], size: int) -> Texture:
     area = np.linalg.norm(area_vectors(mesh), axis=1).sum()
     places = Places(at.of(mesh.vertices), normals, math.sqrt(area / max(len(at.rows), 1)))
     with progress_bar("Colours from photos", passing=True) as progress:
-        found = baked(places, mesh, photos, at.of(mesh.colors), progress)
-    image = picture(atlas, at, found.colors)
+        mean = baked(places, mesh, photos, at.of(mesh.colors), progress)
+    image = picture(atlas, at, mean.colors)
     with progress_bar("Texture fitted to photos", passing=True) as progress:
-        image = fitted(image, atlas, mesh, photos, found.exposures, progress)
-    return Texture(atlas, image, float(found.seen.mean()) if len(found.seen) else 0.0, found.exposures)
+        image = fitted(image, atlas, mesh, photos, mean.exposures, progress)
+    return Texture(atlas, image, float(mean.seen.mean()) if len(mean.seen) else 0.0, mean.exposures)
 
 
 def suitable_density(mesh: Mesh, photos: Sequence[Photo]) -> float:
-    """Return how many texels along a side of the mesh's unit are a bit finer than a pixel of the nearer photos.
+    """Return the texels per unit of the mesh that are slightly finer than pixels of the nearer photos.
 
-    Photos count that have the mesh before them; 0 without any.
+    Only photos with the mesh in front of the camera count; without any, it is 0.
     """
     middle = torch.from_numpy((mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2)
     finest = []

@@ -8,7 +8,8 @@ import pytest
 import torch
 from raster_scenes import CLASSES, make_scene
 
-from beags_plugin.assignment.assignment import assign_classes
+from beags_plugin.assignment.assignment import by_largest
+from beags_plugin.assignment.contributions import contributions
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.rasterizers import RASTERIZERS, make_rasterizer
@@ -43,8 +44,10 @@ def test_sums_over_views_with_ties_to_the_lower_id():
         SimpleNamespace(table=[[0, 0, 0]] * 4, height=2, width=2),
     ]
     mask, calls = torch.zeros(2, 2, dtype=torch.int32), []
-    result = assign_classes(
-        _surfels(4), cameras, [mask, mask, None], _Stub(), SETTINGS, 3, progress=lambda *state: calls.append(state)
+    result = by_largest(
+        contributions(
+            _surfels(4), cameras, [mask, mask, None], _Stub(), SETTINGS, 3, progress=lambda *state: calls.append(state)
+        )
     )
     assert result.class_ids.dtype == torch.int32
     assert result.class_ids.tolist() == [2, 0, 1, 2]
@@ -56,7 +59,9 @@ def test_sums_over_views_with_ties_to_the_lower_id():
 
 def test_small_weights_of_many_views_are_not_lost():
     cameras = [SimpleNamespace(table=[[1e8, 0.0]])] + [SimpleNamespace(table=[[0.0, 1.0]])] * 3
-    result = assign_classes(_surfels(1), cameras, [torch.zeros(1, 1, dtype=torch.int32)] * 4, _Stub(), SETTINGS, 2)
+    result = by_largest(
+        contributions(_surfels(1), cameras, [torch.zeros(1, 1, dtype=torch.int32)] * 4, _Stub(), SETTINGS, 2)
+    )
     assert result.margin.item() == pytest.approx(1e8 / (1e8 + 3), abs=1e-7)
 
 
@@ -67,7 +72,9 @@ def test_contributions_are_image_derivatives():
     sh = torch.zeros(len(inputs.means), 1, 3).double()
     surfels = Surfels.of(inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits, sh)
     rasterizer = make_rasterizer("torch")
-    result = assign_classes(surfels, [scene.camera] * 2, [scene.target, None], rasterizer, scene.settings, CLASSES)
+    result = by_largest(
+        contributions(surfels, [scene.camera] * 2, [scene.target, None], rasterizer, scene.settings, CLASSES)
+    )
     colors = torch.zeros_like(inputs.means).requires_grad_()
     bare = geometry_inputs(surfels)
     coloured = type(bare)(bare.means, bare.quats, bare.log_scales, bare.opacity_logits, colors)
@@ -85,7 +92,7 @@ def test_contributions_are_image_derivatives():
 def test_ids_out_of_range_are_refused():
     mask = torch.tensor([[0, IGNORE, 5]], dtype=torch.int32)
     with pytest.raises(UserError, match="view 0 holds class ids 0..5"):
-        assign_classes(_surfels(1), [SimpleNamespace(table=[[1.0]])], [mask], _Stub(), SETTINGS, 3)
+        by_largest(contributions(_surfels(1), [SimpleNamespace(table=[[1.0]])], [mask], _Stub(), SETTINGS, 3))
 
 
 @pytest.mark.parametrize("backend", ["torch", "native"])

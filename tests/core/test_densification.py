@@ -73,7 +73,7 @@ def test_a_small_surfel_is_cloned_and_a_large_one_split():
     offset = halves.means - surfels.means[1]
     normal = rotation_from_quat(surfels.quats[1])[:, 2]
     assert (offset.norm(dim=-1) > 0).all() and not torch.equal(*offset)
-    torch.testing.assert_close(offset @ normal, torch.zeros(2), rtol=0, atol=1e-6)  # in the surfel's own plane
+    torch.testing.assert_close(offset @ normal, torch.zeros(2), rtol=0, atol=1e-6)  # the surfel's plane
 
 
 def test_halves_are_spread_like_the_surfel_they_replace():

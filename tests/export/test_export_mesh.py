@@ -70,13 +70,13 @@ def item(thing) -> ExportItem:
 
 @pytest.fixture(scope="module")
 def mesh(item) -> Mesh:
-    return GlbExporter(**OPTIONS).mesh(item)
+    return GlbExporter(**OPTIONS).made(item).mesh
 
 
 def test_vertices_lie_on_the_exact_surface(thing, mesh):
     assert mesh.voxel == pytest.approx(2 * 0.18 / 96, rel=0.15)
     off = np.abs(distance(thing, mesh.vertices))
-    # not all: at sharp edges discs stick out
+    # Some vertices lie outside: discs stick out at sharp edges.
     assert np.quantile(off, 0.9) < mesh.voxel and off.max() < 4 * mesh.voxel
     assert np.median(off) < 0.5 * mesh.voxel
 
@@ -140,13 +140,13 @@ def test_a_view_of_a_few_pixels_adds_nothing(item, mesh, monkeypatch):
         return depth, color
 
     monkeypatch.setattr(fusion, "_draw", drawn)
-    found = GlbExporter(**OPTIONS).mesh(replace(item, shared={}))
+    found = GlbExporter(**OPTIONS).made(replace(item, shared={})).mesh
     assert next(calls) > 20 and len(found.faces) == pytest.approx(len(mesh.faces), rel=0.1)
 
 
 def test_both_file_types_share_one_mesh(item):
     glb, obj = (make_exporter(name, **OPTIONS) for name in ("glb", "obj"))
-    assert glb.mesh(item) is obj.mesh(item)
+    assert glb.made(item) is obj.made(item)
 
 
 @pytest.mark.slow("fuses a voxel grid of hundreds of MB")
@@ -166,7 +166,7 @@ def test_a_small_object_gets_few_faces_and_the_option_another_number(item):
     discs = item.surfels[::100]
     some = replace(item, surfels=replace(discs, log_scales=discs.log_scales + 2.5), shared={})
     for options, most in (({}, 20 * len(some.surfels)), ({"triangles": 1000}, 1000)):
-        assert 0.97 * most <= len(GlbExporter(resolution=64, **options).mesh(some).faces) <= most
+        assert 0.97 * most <= len(GlbExporter(resolution=64, **options).made(some).mesh.faces) <= most
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
@@ -181,9 +181,9 @@ def test_the_scale_of_a_scene_changes_nothing(item, mesh, scale):
     large = replace(surfels, means=scale * surfels.means, log_scales=surfels.log_scales + float(np.log(scale)))
     settings = RasterSettings(scale * views.settings.near, scale * views.settings.far)
     views = Viewpoints([scaled(camera) for camera in views.cameras], views.rasterizer, settings)
-    other = GlbExporter(**OPTIONS).mesh(replace(item, surfels=large, views=views, shared={}))
+    other = GlbExporter(**OPTIONS).made(replace(item, surfels=large, views=views, shared={})).mesh
     assert other.voxel == pytest.approx(scale * mesh.voxel, rel=1e-5)
-    # not bit by bit: a pixel's depth may fall to the neighbouring disc
+    # The bits differ: a pixel's depth may be that of the neighbouring disc.
     distance, _ = cKDTree(mesh.vertices).query(other.vertices / scale)
     assert np.quantile(distance, 0.99) < 0.1 * mesh.voxel
 
@@ -193,7 +193,7 @@ def test_the_same_mesh_for_any_number_of_threads(item, mesh):
     for count in (1, 4):
         torch.set_num_threads(count)
         try:
-            again = GlbExporter(**OPTIONS).mesh(replace(item, shared={}))
+            again = GlbExporter(**OPTIONS).made(replace(item, shared={})).mesh
         finally:
             torch.set_num_threads(threads)
         for name in ("vertices", "faces", "colors"):
@@ -243,7 +243,7 @@ def test_the_grid_keeps_its_bound(item, monkeypatch):
     grids = []
     make = fusion._new_grid
     monkeypatch.setattr(fusion, "_new_grid", lambda: grids.append(make()) or grids[-1])
-    mesh = GlbExporter(resolution=400, memory_mb=60.0).mesh(replace(item, shared={}))
+    mesh = GlbExporter(resolution=400, memory_mb=60.0).made(replace(item, shared={})).mesh
     low, high = bounding_box(item.surfels)
     assert mesh.voxel > float((high - low).max()) / 400
     assert 0 < grids[0].hashmap().size() * 16**3 * 20 / 1e6 < 60.0

@@ -35,7 +35,7 @@ from beags_plugin.surfaces.frames import bounding_box
 from beags_plugin.surfaces.item import ExportItem, NothingToExport, Viewpoints
 from beags_plugin.system.errors import UserError
 
-DRAWN = 215  # of 255: darker pixels are the object's, on white
+DRAWN = 215  # grey value, of 255, below which a pixel shows the object on white
 
 
 def viewpoints(*cameras: Camera) -> Viewpoints:

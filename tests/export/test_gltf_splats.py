@@ -153,7 +153,7 @@ def test_a_known_gaussian_has_known_values(tmp_path):
     s = math.sqrt(0.5)  # a quarter turn back about x
     assert found[f"{PREFIX}:ROTATION"] == pytest.approx([-s, 0, 0, s], abs=1e-6)
     assert found[f"{PREFIX}:SH_DEGREE_0_COEF_0"].tolist() == [0.0, 1.0, -9.0]
-    # of band 1, the functions of -y, z and -x: z of ours is its y, and y its -z
+    # Band 1 has the functions -y, z and -x; our z is the file's y, and our y its -z.
     assert found[f"{PREFIX}:SH_DEGREE_1_COEF_0"] == pytest.approx([-0.4, -0.5, -0.6], abs=1e-6)
     assert found[f"{PREFIX}:SH_DEGREE_1_COEF_1"] == pytest.approx([0.1, 0.2, 0.3], abs=1e-6)
     assert found[f"{PREFIX}:SH_DEGREE_1_COEF_2"] == pytest.approx([0.7, 0.8, 0.9], abs=1e-6)
@@ -210,7 +210,7 @@ def test_a_scene_whose_nodes_move_it_is_read_where_they_put_it(tmp_path):
     content["scenes"] = [{"nodes": [3]}]
     (tmp_path / "moved.gltf").write_text(json.dumps(content))
     found, plain = (read_scene(tmp_path / name).gaussians for name in ("moved.gltf", "scene.glb"))
-    x, y, z = plain.means.unbind(1)  # about its y, which is our z
+    x, y, z = plain.means.unbind(1)  # The file's y is our z.
     assert torch.allclose(found.means, torch.stack([-2 * y, 2 * x, 2 * z + 5], dim=1), atol=1e-5)
     assert torch.allclose(found.log_scales, plain.log_scales + math.log(2), atol=1e-5)
     content["nodes"][3]["scale"] = [1, 2, 1]

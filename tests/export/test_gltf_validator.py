@@ -79,7 +79,7 @@ def test_the_validator_finds_nothing(tmp_path, textured, closed):
     invented = mesh.vertices[:, 2] < 2.9 if closed else None
     path = tmp_path / "ball.glb"
     path.write_bytes(glb_bytes(mesh, 'a "cup" of naïve tea', texture_of(mesh) if textured else None, invented))
-    if closed:  # and where map coordinates put it
+    if closed:  # The file also stands where map coordinates put it.
         assert make_exporter("glb").to_world(path, torch.tensor([453_211.37, 5_411_873.94, 512.25]).double())
     found = report(path)
     assert found["issues"]["messages"] == [], found["issues"]

@@ -11,12 +11,13 @@ from run_folders import discs, drawn_labels, ring_cameras, state_of, write_drawn
 
 pytest.importorskip("nerfstudio")
 
+from written_splats import read_ply
+
 from beags_plugin.commands.cli import main
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.classes import write_mask
 from beags_plugin.runs.relocation import open_run
 from beags_plugin.runs.write import write_run
-from beags_plugin.splat_io.ply import read_ply
 
 CHIP = 3  # discs
 

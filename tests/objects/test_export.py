@@ -16,6 +16,8 @@ from run_folders import CLASSES, discs, write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
+from written_splats import read_ply
+
 from beags_plugin.commands.cli import main
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.select import select_class
@@ -27,7 +29,6 @@ from beags_plugin.objects.export import export_run
 from beags_plugin.objects.exported import ExportedFile
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.splat_io.files import whole_file
-from beags_plugin.splat_io.ply import read_ply
 from beags_plugin.surfaces.frames import Frame, bounding_box
 from beags_plugin.surfaces.item import ExportItem, Viewpoints
 from beags_plugin.surfaces.mesh_options import MeshOptions

@@ -16,6 +16,8 @@ from run_folders import discs, write_drawn_scene, write_prepared, write_scene, w
 
 pytest.importorskip("nerfstudio")
 
+from written_splats import read_ply
+
 from beags_plugin.commands.cli import main
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.select import select_class
@@ -23,7 +25,6 @@ from beags_plugin.export.pose_options import PhotoPoint
 from beags_plugin.objects.pose import _pixel
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.runs.read import read_run, read_transform
-from beags_plugin.splat_io.ply import read_ply
 from beags_plugin.surfaces.frames import Frame
 from beags_plugin.surfaces.item import Viewpoints
 from beags_plugin.system.errors import UserError

@@ -112,7 +112,7 @@ def test_files_in_metres_say_their_origin(far, tmp_path):
     export_run(far, ("cup",), output=tmp_path, keep_all=True, pose=pose, say=said.append)
     table = read_vertices(tmp_path / "cup.ply")
     assert table.dtype["x"] == np.float32 and max(np.abs(table[axis]).max() for axis in "xyz") < 20
-    assert "the files' origin is the point 453211" in said[0]
+    assert "the files' origin is its point 453211" in said[0]
 
 
 def test_extracted_objects_are_in_map_coordinates(far, tmp_path):

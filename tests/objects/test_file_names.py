@@ -9,9 +9,10 @@ from run_folders import rename_classes, write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
+from written_splats import read_ply
+
 from beags_plugin.commands.cli import main
 from beags_plugin.objects.extract import folder_names
-from beags_plugin.splat_io.ply import read_ply
 from beags_plugin.system.reading.ply import read_vertices
 
 

@@ -16,11 +16,12 @@ from run_folders import discs, rename_classes, state_of, write_scene, write_trai
 
 pytest.importorskip("nerfstudio")
 
+from written_splats import read_ply
+
 from beags_plugin.commands.cli import main
 from beags_plugin.importers.base import read_scene
 from beags_plugin.runs.relocation import open_run
 from beags_plugin.runs.write import write_run
-from beags_plugin.splat_io.ply import read_ply
 from beags_plugin.system.reading.ply import read_vertices
 
 

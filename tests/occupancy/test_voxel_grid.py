@@ -15,7 +15,7 @@ from beags_plugin.core.lifting import lift
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.occupancy.build import build_visibility_grid
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.occupancy.voxel_size import voxel_size
+from beags_plugin.occupancy.voxel_size import voxel_size_of_reference
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.system.errors import UserError
@@ -34,8 +34,8 @@ def _clouds():
     return [(torch.rand(60, 3, generator=g) * 2 - 0.7, torch.randint(0, CLASSES, (60,), generator=g).int())] * 2
 
 
-def _grid(dense_bytes: int = 1 << 28) -> VisibilityGrid:
-    return VisibilityGrid.from_points(_clouds(), SIZE, torch.tensor(ORIGIN, dtype=torch.float64), CLASSES, dense_bytes)
+def _grid() -> VisibilityGrid:
+    return VisibilityGrid.from_points(_clouds(), SIZE, torch.tensor(ORIGIN, dtype=torch.float64), CLASSES)
 
 
 def _voxels(points: torch.Tensor, ids: torch.Tensor) -> list[tuple[int, tuple[int, ...]]]:
@@ -57,9 +57,8 @@ def _queries():
 
 
 @both
-@pytest.mark.parametrize("dense_bytes", [1 << 28, 0])
-def test_count_and_valid_equal_sets(dense_bytes):
-    grid, sets = _grid(dense_bytes), _by_sets()
+def test_count_and_valid_equal_sets():
+    grid, sets = _grid(), _by_sets()
     points, ids = _queries()
     steps = list(itertools.product((-1, 0, 1), repeat=3))
     expected = [sum((x + i, y + j, z + k) in sets[c] for i, j, k in steps) for c, (x, y, z) in _voxels(points, ids)]
@@ -73,7 +72,7 @@ def test_count_and_valid_equal_sets(dense_bytes):
 def test_colliding_classes_leave_a_voxel_empty():
     points = torch.tensor([[0.5, 0.5, 0.5], [0.6, 0.6, 0.6], [5.5, 0.5, 0.5], [5.6, 0.5, 0.5]])
     ids = torch.tensor([1, 2, 1, 1], dtype=torch.int32)
-    clouds = [(points[:1], ids[:1]), (points[1:], ids[1:])]  # in two views
+    clouds = [(points[:1], ids[:1]), (points[1:], ids[1:])]  # two views
     grid = VisibilityGrid.from_points(clouds, 1.0, torch.zeros(3), 3)
     assert len(grid.keys) == 1 and grid.classes.tolist() == [1]
     assert grid.count(points, ids).tolist() == [0, 0, 1, 1]
@@ -83,28 +82,24 @@ def test_colliding_classes_leave_a_voxel_empty():
 
 
 @both
-@pytest.mark.parametrize("dense_bytes", [1 << 28, 0])
-def test_empty_grid_and_wild_points(dense_bytes):
-    none = VisibilityGrid.from_points([], 1.0, torch.zeros(3), 2, dense_bytes)
+def test_empty_grid_and_wild_points():
+    none = VisibilityGrid.from_points([], 1.0, torch.zeros(3), 2)
     points = torch.tensor(
         [[0.0, 0, 0], [math.nan, 0, 0], [math.inf, 0, 0], [-math.inf, 0, 0], [1e30, 0, 0], [-3e9, 0, 0]]
     )
     ids = torch.ones(6, dtype=torch.int32)
     assert not none.valid(points, ids).any() and not none.count(points, ids).any()
-    one = VisibilityGrid.from_points([(torch.zeros(1, 3), ids[:1])], 1.0, torch.zeros(3), 2, dense_bytes)
+    one = VisibilityGrid.from_points([(torch.zeros(1, 3), ids[:1])], 1.0, torch.zeros(3), 2)
     assert one.valid(points, ids).tolist() == [True] + [False] * 5
     assert one.count(points, ids).tolist() == [1] + [0] * 5
 
 
 @both
 def test_one_voxel_reaches_exactly_its_27_neighbours():
-    for dense_bytes in (1 << 28, 0):
-        grid = VisibilityGrid.from_points(
-            [(torch.full((1, 3), 0.5), torch.ones(1).int())], 1.0, torch.zeros(3), 2, dense_bytes
-        )
-        steps = torch.tensor(list(itertools.product(range(-3, 4), repeat=3)))
-        valid = grid.valid(steps + 0.5, torch.ones(len(steps)).int())
-        assert torch.equal(valid, (steps.abs() <= 1).all(1))
+    grid = VisibilityGrid.from_points([(torch.full((1, 3), 0.5), torch.ones(1).int())], 1.0, torch.zeros(3), 2)
+    steps = torch.tensor(list(itertools.product(range(-3, 4), repeat=3)))
+    valid = grid.valid(steps + 0.5, torch.ones(len(steps)).int())
+    assert torch.equal(valid, (steps.abs() <= 1).all(1))
 
 
 @both
@@ -138,14 +133,13 @@ def test_too_many_voxels_are_told():
 
 
 @both
-@pytest.mark.parametrize("dense_bytes", [1 << 28, 0])
 @pytest.mark.parametrize("origin", [ORIGIN, (1000.1, -500.0, 0.0)])
-def test_disc_inside_is_never_wrong(dense_bytes, origin):
+def test_disc_inside_is_never_wrong(origin):
     """Every one of many points of every disc that is called inside is valid; float32 far from 0 as well."""
     g = torch.Generator().manual_seed(4)
     shift = torch.tensor(origin) - torch.tensor(ORIGIN)
     clouds = [(torch.rand(3000, 3, generator=g) * 1.5 + shift, torch.ones(3000).int())]
-    grid = VisibilityGrid.from_points(clouds, SIZE, torch.tensor(origin, dtype=torch.float64), 2, dense_bytes)
+    grid = VisibilityGrid.from_points(clouds, SIZE, torch.tensor(origin, dtype=torch.float64), 2)
     count = 4000
     means = torch.rand(count, 3, generator=g) * 2.6 - 0.5 + shift
     axes = torch.randn(count, 2, 3, generator=g) * (0.3 * torch.rand(count, 1, 1, generator=g))
@@ -221,7 +215,8 @@ def test_build_lifts_solid_pixels_of_all_views(kind):
     depths = [view.median_depth if kind == "median" else view.depth for view in views]
     points = torch.cat([lift(d, v)[s] for d, v, s in zip(depths, views, solid, strict=True)])
     ids = torch.cat([v.classes[s] for v, s in zip(views, solid, strict=True)])
-    assert grid.voxel_size == pytest.approx(voxel_size(points.numpy(), k=3))  # of all classes together
+    together = voxel_size_of_reference(points.numpy(), len(points), k=3)  # the size for all classes together
+    assert grid.voxel_size == pytest.approx(together)
     expected = VisibilityGrid.from_points([(points, ids)], grid.voxel_size, grid.origin, CLASSES)
     assert len(expected.keys) > 10
     assert torch.equal(grid.keys, expected.keys) and torch.equal(grid.classes, expected.classes)
@@ -256,11 +251,10 @@ def test_build_with_the_reference_rasterizer():
     assert not grid.valid(means - torch.tensor([0.0, 0.0, 3.0]), ids).any()
 
 
-@pytest.mark.parametrize("dense_bytes", [0, 2**28])
-def test_a_grid_of_some_classes_answers_the_same_about_them(dense_bytes, ops):
+def test_a_grid_of_some_classes_answers_the_same_about_them(ops):
     g = torch.Generator().manual_seed(9)
     points, ids = torch.rand(3000, 3, generator=g) * 2, torch.randint(0, 4, (3000,), generator=g)
-    grid = VisibilityGrid.from_points([(points, ids)], 0.2, torch.zeros(3), 4, dense_bytes)
+    grid = VisibilityGrid.from_points([(points, ids)], 0.2, torch.zeros(3), 4)
     part = grid.only(torch.tensor([3, 1]))
     asked = torch.rand(4000, 3, generator=g) * 2.4 - 0.2
     classes = torch.arange(4000) % 4

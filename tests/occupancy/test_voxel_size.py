@@ -7,11 +7,18 @@ import math
 import numpy as np
 import pytest
 
-from beags_plugin.occupancy.voxel_size import voxel_size
+from beags_plugin.occupancy.voxel_size import MAX_REFERENCE, reference_indices, voxel_size_of_reference
 
 both = pytest.mark.usefixtures("ops")  # run with the torch versions and with the compiled ops
 
 E8 = (4 * math.pi / 3) ** (1 / 3)  # 1.612
+
+
+def voxel_size(
+    points: np.ndarray, k: int = 2000, seed: int = 0, max_reference: int = MAX_REFERENCE, **options
+) -> float:
+    chosen = reference_indices(len(points), k, seed, max_reference)
+    return voxel_size_of_reference(points[chosen], len(points), k, seed, **options)
 
 
 def _cube_cloud(count: int) -> np.ndarray:
@@ -49,7 +56,7 @@ def test_size_is_deterministic_and_scales():
 
 def test_fewer_points_than_k():
     points = np.random.default_rng(2).normal(size=(20, 3))
-    with pytest.warns(UserWarning, match="wants 2000 neighbours, the views show 19"):
+    with pytest.warns(UserWarning, match="needs 2000 neighbours, but the views show 19"):
         size = voxel_size(points)
     farthest = np.linalg.norm(points[:, None] - points[None], axis=-1).max(1).mean()
     assert size == pytest.approx(E8 * farthest)

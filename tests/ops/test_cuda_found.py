@@ -31,8 +31,8 @@ def test_a_driver_that_is_new_enough_will_do(found):
 
 def test_a_driver_that_is_too_old_is_named(found):
     reason = found(12060, 13000)
-    assert "knows CUDA up to 12.6" in reason and "nvcc for 13.0 or newer" in reason
-    assert found(13000, 13020) is not None  # of PTX
+    assert "supports CUDA up to 12.6" in reason and "nvcc for 13.0 or newer" in reason
+    assert found(13000, 13020) is not None  # the driver compiles PTX
 
 
 def test_a_module_without_kernels_says_how_to_get_them(monkeypatch):

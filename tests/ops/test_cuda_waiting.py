@@ -27,7 +27,7 @@ from beags_plugin.ops.voxel_lookup import VoxelLookup
 from beags_plugin.rasterizers.interface import RasterOutputs
 
 N, HEIGHT, WIDTH = 50, 40, 60
-ON_HOST = Camera(torch.eye(4), torch.eye(3), WIDTH, HEIGHT)  # with data
+ON_HOST = Camera(torch.eye(4), torch.eye(3), WIDTH, HEIGHT)  # a camera whose matrices have data
 LOSSES = [
     PhotometricLoss(),
     NormalConsistencyLoss(),

@@ -151,7 +151,7 @@ def test_whole_discs_inside_are_skipped_exactly():
     inside = inside_valid_voxels(parameters[0], axes, ids, grid)
     assert 100 < int(inside.sum()) < 2000
     assert 3000 - active == pytest.approx(int(inside.sum()), abs=3)  # boxes in float32 and float64 round differently
-    skipped_before = grid.disc_inside(parameters[0], axes[..., 0], axes[..., 1], ids)  # of at most 4 voxels
+    skipped_before = grid.disc_inside(parameters[0], axes[..., 0], axes[..., 1], ids)  # boxes of at most 4 voxels
     assert int((skipped_before & ~inside).sum()) <= 3 and int(inside.sum()) > int(skipped_before.sum()) + 20
     assert not any(value[inside].any() for value in out)  # none of 400 samples of theirs is outside
     assert all(torch.isfinite(value).all() for value in out)

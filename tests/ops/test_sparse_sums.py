@@ -25,7 +25,7 @@ def test_they_are_a_dense_table_bit_for_bit(way, dtype):
         values = values * 10.0 ** torch.randint(-6, 3, (1,), generator=generator)
         dense += torch.where(chosen, values, 0.0).double()
         sparse.add(chosen.nonzero()[:, 0], values[chosen])
-    keys, sums = sparse.found()
+    keys, sums = sparse.totals()
     assert keys.tolist() == dense.nonzero()[:, 0].tolist() and torch.equal(sums, dense[keys])
     table = dense.view(ROWS, COLUMNS)
     first, top, everything = largest_in_rows(keys, sums, ROWS, COLUMNS)
@@ -37,10 +37,10 @@ def test_they_are_a_dense_table_bit_for_bit(way, dtype):
 def test_nothing_and_equals(way):
     sums = way()
     sums.add(torch.zeros(0, dtype=torch.int64), torch.zeros(0))
-    assert [value.tolist() for value in largest_in_rows(*sums.found(), 2, 3)] == [[0, 0], [0.0, 0.0], [0.0, 0.0]]
+    assert [value.tolist() for value in largest_in_rows(*sums.totals(), 2, 3)] == [[0, 0], [0.0, 0.0], [0.0, 0.0]]
     sums.add(torch.tensor([4, 5]), torch.tensor([2.0, 2.0]))
     sums.add(torch.zeros(0, dtype=torch.int64), torch.zeros(0))
-    assert [value.tolist() for value in largest_in_rows(*sums.found(), 2, 3)] == [[0, 1], [0.0, 2.0], [0.0, 4.0]]
+    assert [value.tolist() for value in largest_in_rows(*sums.totals(), 2, 3)] == [[0, 1], [0.0, 2.0], [0.0, 4.0]]
 
 
 def test_wrong_tensors_are_refused():

@@ -79,8 +79,8 @@ def test_memory_is_linear_in_the_voxels():
     """Two clouds of 300 voxels, one 40,000 times as far apart: an array would take 10^13 times the memory."""
     near, far = make_grid(4.0), make_grid(200_000.0)
     for grid in (near, far):
-        assert grid.lookup().bytes < 300 * len(grid.keys) + (1 << 20)
-    assert far.lookup().bytes < 10 * near.lookup().bytes + 300 * len(far.keys)
+        assert grid.lookup().native.bytes < 300 * len(grid.keys) + (1 << 20)
+    assert far.lookup().native.bytes < 10 * near.lookup().native.bytes + 300 * len(far.keys)
 
 
 def test_the_first_and_last_voxel_of_the_range():

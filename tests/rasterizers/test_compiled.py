@@ -89,7 +89,7 @@ def test_float32_stays_within_its_band(compiled, name):
         a, b = getattr(found, output), getattr(expected, output)
         assert a.dtype == torch.float32
         assert ((a - b).abs() > 1e-4 * b.abs().clamp_min(1.0)).float().mean() < 2e-3, output
-    # of two pixels that differ by a skipped hit, a weight of 1/255 is the most that can be missing in A
+    # Two pixels that differ by a skipped hit differ in A by a weight of 1/255 at most.
     assert (found.alpha - expected.alpha).abs().max() < 1.1 / 255
 
 

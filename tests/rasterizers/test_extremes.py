@@ -8,7 +8,8 @@ import pytest
 import torch
 from raster_scenes import CLASSES, FLOATS, OUTPUTS, make_scene
 
-from beags_plugin.assignment.assignment import assign_classes
+from beags_plugin.assignment.assignment import by_largest
+from beags_plugin.assignment.contributions import contributions
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
@@ -95,7 +96,7 @@ def test_one_class_and_as_many_as_there_are_ids(rasterizer, num_classes):
     arguments = (inputs, scene.camera, scene.settings)
     parameters = (getattr(scene.inputs, name) for name in FLOATS[:4])
     surfels = Surfels.of(*parameters, scene.inputs.colors[:, None])
-    assigned = assign_classes(surfels, [scene.camera], [target], rasterizer, scene.settings, num_classes)
+    assigned = by_largest(contributions(surfels, [scene.camera], [target], rasterizer, scene.settings, num_classes))
     assert int(assigned.class_ids.max()) <= last and int(assigned.class_ids.min()) >= 0
     ids, share = rasterizer.class_map(*arguments, num_classes)
     assert int(ids[ids != IGNORE].max()) <= last and share.isfinite().all()

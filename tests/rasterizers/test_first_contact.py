@@ -80,10 +80,10 @@ def test_a_child_that_agrees_and_one_that_differs():
 
 @pytest.mark.slow("each trial is a process that imports torch")
 def test_a_child_that_crashes_or_fails():
-    assert try_in_child("tried_backends:Crashes", ["cpu"]) == "drawing a small scene ended with SIGSEGV"
+    assert try_in_child("tried_backends:Crashes", ["cpu"]) == "rendering a small scene ended with SIGSEGV"
     reason = try_in_child("tried_backends:Raises", ["cpu"])
     illegal = "RuntimeError: CUDA error: an illegal memory access was encountered"
-    assert reason == f"drawing a small scene failed ({illegal})"
+    assert reason == f"rendering a small scene failed ({illegal})"
     assert "No module named 'no_such'" in try_in_child("no_such:Thing", ["cpu"])
     assert try_in_child("tried_backends:Chatters", ["cpu"]).endswith("ended without a result (Bye.)")
 
@@ -91,7 +91,7 @@ def test_a_child_that_crashes_or_fails():
 @pytest.mark.slow("each trial is a process that imports torch")
 def test_a_child_that_hangs_is_ended():
     began = time.monotonic()
-    assert try_in_child("tried_backends:Hangs", ["cpu"], 3.0) == "a small scene was not drawn within 3 seconds"
+    assert try_in_child("tried_backends:Hangs", ["cpu"], 3.0) == "a small scene was not rendered within 3 seconds"
     assert time.monotonic() - began < 60
 
 
@@ -105,7 +105,7 @@ def test_a_verdict_is_kept_for_this_build_these_gpus_and_this_driver(trials):
         assert verdict(changed).reason == ""
     assert len(trials) == 4
     assert verdict(contact(), anew=True).reason == "" and len(trials) == 5
-    assert len(list(first_contact.cache_folder().iterdir())) == 4
+    assert len(list(contact().file().parent.iterdir())) == 4
 
 
 @pytest.mark.usefixtures("trials")
@@ -169,9 +169,9 @@ def test_auto_does_without_one_that_fails_and_says_so_once(monkeypatch, capfd, b
         rasterizer = make_rasterizer("auto")
         assert isinstance(rasterizer, DeviceDispatchRasterizer)
         assert isinstance(rasterizer.cpu, NativeRasterizer) and isinstance(rasterizer.gpu, TorchRasterizer)
-    module, reason = cuda_extension.status()  # and so no op computes there either
+    module, reason = cuda_extension.status()  # No op computes on the GPU either.
     assert module is None and cuda_extension.load() is None
-    assert reason is not None and why in reason and "the CPU serves in place of NVIDIA X" in reason
+    assert reason is not None and why in reason and "the CPU is used instead of NVIDIA X" in reason
     lines = capfd.readouterr().err.splitlines()
     assert len(lines) == 2 and lines[1] == reason[0].upper() + reason[1:]
 
@@ -233,7 +233,7 @@ def test_the_doctor_tries_anew_and_shows_the_verdict(monkeypatch):
     Gpu(monkeypatch, "DrawsWrongly")
     found = first_contact_check()
     assert not found.ok and not found.required
-    assert found.sentence.startswith("the CPU serves in place of NVIDIA X: the image depth differs")
+    assert found.sentence.startswith("the CPU is used instead of NVIDIA X: the image depth differs")
     Gpu(monkeypatch, "Agrees")
     found = first_contact_check()
     assert found.ok and found.sentence.startswith("NVIDIA X draws what the torch reference draws")

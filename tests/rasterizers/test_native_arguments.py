@@ -50,7 +50,7 @@ def test_results_are_written_where_the_caller_looks():
 def test_anything_else_is_a_type_error_that_names_what_is_wanted(wrong):
     with pytest.raises(TypeError, match=r"torch.Tensor\[float32, contiguous, cpu\]"):
         photometric(wrong)
-    assert photometric(IMAGE)[0] == 0.0  # and leaves nothing behind
+    assert photometric(IMAGE)[0] == 0.0  # The call leaves no state behind.
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")

@@ -120,12 +120,14 @@ def test_objects_hold_nothing_that_other_processors_may_run(name):
         pytest.skip("nm is missing")
     space, kernels = OBJECTS[name]
     objects = sorted(ROOT.glob(f"build/**/{name}.cpp.o"))
-    objects = [file for file in objects if "sanitize" not in file.parts]  # which hold the sanitizer's own functions
+    objects = [
+        file for file in objects if "sanitize" not in file.parts
+    ]  # Those files hold the sanitizer's own functions.
     if not objects:
         pytest.skip(f"there is no object of {name}.cpp in build/")
     for built in objects:
         lines = subprocess.run(["nm", "-C", built], capture_output=True, text=True, check=True).stdout.splitlines()
-        symbols = [line[17:].split(" ", 1) for line in lines]  # after the address
+        symbols = [line[17:].split(" ", 1) for line in lines]  # The address takes 17 characters.
         defined = [text for kind, text in symbols if kind not in "Ur"]
         assert space + kernels in defined
         assert [text for text in defined if space not in text] == []

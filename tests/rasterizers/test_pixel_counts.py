@@ -31,7 +31,7 @@ CASES = {  # surfels, labels, least weight: counts by class, and sums of weights
     "one further off": ([(38, 32, 4, 0.8)], HALVES, 0.0, [[118, 422]], None),
     "one inside": ([(46, 32, 4, 0.8)], HALVES, 0.0, [[0, 540]], None),
     "one behind the camera": ([(46, 32, -4, 0.8)], HALVES, 0.0, [[0, 0]], None),
-    # as many pixels at a hundredth of the weight
+    # The same number of pixels counts at a hundredth of the weight.
     "one behind an opaque layer": (
         [(32, 32, WIDE, 0.999), (32, 32, 4, 0.8)], HALVES, 0.0, [[2048, 2048], [270, 270]], None,
     ),

@@ -131,7 +131,7 @@ def test_a_disc_that_crosses_the_camera_plane_reaches_the_whole_screen(rasterize
     near = 0.1
     drawn = rasterizer.rasterize(inputs, camera, RasterSettings(near, 100.0), torch.zeros(3, **double))
     rows, columns = torch.meshgrid(torch.arange(35) + 0.5, torch.arange(40) + 0.5, indexing="ij")
-    depth = 0.5 * 20.0 / (rows.double() - 17.0)  # where the ray meets the floor y = 0.5
+    depth = 0.5 * 20.0 / (rows.double() - 17.0)  # The ray meets the floor y = 0.5 there.
     u, v = (columns - 18.0) / 20.0 * depth / math.e, (depth - 1.0) / math.e
     alpha = torch.sigmoid(torch.tensor(4.0, **double)) * torch.exp(-0.5 * (u * u + v * v))
     below = (depth >= near) & (alpha >= 1 / 255)

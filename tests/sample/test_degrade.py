@@ -11,7 +11,6 @@ from beags_plugin.sample.degrade import (
     degrade_mask,
     dropped_views,
     resolve_degradation,
-    rim_amplitude,
     roughen_rims,
     swap_pieces,
 )
@@ -38,21 +37,20 @@ def test_rims_move_only_near_boundaries(labels):
 def test_swaps_are_one_connected_piece_of_an_object(labels):
     from scipy import ndimage
 
-    found, swaps = swap_pieces(labels, 8, 0.5, seed=4, view="b")
-    assert swaps
-    assert sum(s.pixels for s in swaps) == np.count_nonzero(found != labels)
-    for swap in swaps:
-        piece = (labels == swap.class_id) & (found != labels)
-        assert ndimage.label(piece)[1] == 1 and piece.sum() == swap.pixels
-        assert set(found[piece]) == {swap.new_id} and swap.new_id != swap.class_id
-        assert 0 < swap.pixels <= 0.7 * np.count_nonzero(labels == swap.class_id)
-    untouched = [i for i in range(1, 8) if i not in {s.class_id for s in swaps}]
-    assert all((found[labels == i] == i).all() for i in untouched)
-    assert (found[labels == 0] == 0).all()
+    found = swap_pieces(labels, 8, 0.5, seed=4, view="b")
+    swapped = np.unique(labels[found != labels])
+    assert 0 < len(swapped) < 7 and 0 not in swapped
+    for class_id in swapped:
+        piece = (labels == class_id) & (found != labels)
+        assert ndimage.label(piece)[1] == 1 and len(np.unique(found[piece])) == 1
+        assert piece.sum() <= 0.7 * np.count_nonzero(labels == class_id)
 
 
 def test_swaps_go_to_objects_and_to_the_background(labels):
-    targets = [s.new_id for view in "abcdefgh" for s in swap_pieces(labels, 8, 1.0, 0, view)[1]]
+    targets = []
+    for view in "abcdefgh":
+        found = swap_pieces(labels, 8, 1.0, 0, view)
+        targets += [found[(labels == i) & (found != labels)][0] for i in np.unique(labels[found != labels])]
     assert 0.25 < np.mean([t == 0 for t in targets]) < 0.75
     assert len(set(targets)) > 4
 
@@ -79,7 +77,6 @@ def test_degradation_depends_on_seed_and_view_alone(labels):
 def test_presets_grow(labels):
     wrong = {n: np.mean([degrade_mask(labels, 8, p, 0, v) != labels for v in "abcdef"]) for n, p in PRESETS.items()}
     assert wrong["none"] == 0.0 < wrong["mild"] < wrong["strong"] < 0.2
-    assert rim_amplitude(0.0075, 240, 320) == pytest.approx(3.0)
     with pytest.raises(UserError, match="mild"):
         resolve_degradation("wild")
     with pytest.raises(UserError, match="swapped"):

@@ -12,9 +12,8 @@ from beags_benchmarks.experiments.scenes import SEEDS
 from beags_plugin.core.cameras import viewmat_from_opengl
 from beags_plugin.sample.desk import make_desk
 from beags_plugin.sample.meshes import Mesh, block, extrude, lathe, sweep
-from beags_plugin.sample.room import make_room
+from beags_plugin.sample.room import make_room, room_views
 from beags_plugin.sample.room_light import RoomLight
-from beags_plugin.sample.room_views import room_views
 from beags_plugin.sample.solids import turned
 from beags_plugin.sample.tracing import first_hits
 from beags_plugin.sample.views import render_view

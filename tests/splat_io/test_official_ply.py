@@ -29,9 +29,9 @@ from beags_plugin.surfaces.item import ExportItem
 from beags_plugin.system.reading.ply import read_vertices
 
 SIZE, FOCAL, DEPTH = 31, 40.0, 2.0  # pixels; the ray of the middle pixel meets the first disc's centre
-TURN = Rotation.from_euler("xyz", (0.4, -0.7, 1.1))  # of the camera in the world
+TURN = Rotation.from_euler("xyz", (0.4, -0.7, 1.1))  # rotation of the camera in the world
 EYE = np.array([0.3, -0.2, 0.5])
-DISCS = (  # behind each other along the ray: depth, sizes along the picture's axes, opacity
+DISCS = (  # discs along the ray: depth, sizes along the image's axes, opacity
     (DEPTH, (0.30, 0.15), 0.7),
     (DEPTH + 0.5, (0.50, 0.80), 0.9),
 )
@@ -123,7 +123,7 @@ def test_an_official_file_is_rendered_as_its_numbers_say(tmp_path, thin_axis):
     drawn = make_rasterizer("auto").rasterize(surfel_inputs(surfels, camera), camera, settings, torch.zeros(3)).color
     picture = expected()
     inside = np.ones((SIZE, SIZE), bool)
-    for depth, (u, v), opacity in DISCS:  # where no rasterizer has cut a tail off
+    for depth, (u, v), opacity in DISCS:  # No rasterizer has cut a tail off there.
         across, down = np.meshgrid(*[(np.arange(SIZE) - SIZE // 2) * depth / FOCAL] * 2)
         inside &= opacity * np.exp(-0.5 * ((across / u) ** 2 + (down / v) ** 2)) > 0.05
     assert inside.sum() > 100 and picture[inside].std() > 0.05

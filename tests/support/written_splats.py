@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -10,6 +11,7 @@ from beags_plugin.core.flattening import Gaussians, flatten
 from beags_plugin.core.surfels import Surfels, opacities
 from beags_plugin.export.base import make_exporter
 from beags_plugin.importers.base import read_scene
+from beags_plugin.splat_io.splat_file import read_splat_file
 from beags_plugin.surfaces.item import ExportItem
 
 
@@ -23,6 +25,13 @@ def write(path: Path, kind: str, surfels: Surfels, **options) -> Path:
 def read_back(path: Path) -> Surfels:
     """The discs of a file."""
     return flatten(read_scene(path).gaussians)[0]
+
+
+def read_ply(path: Path) -> tuple[Surfels, torch.Tensor | None]:
+    """The surfels of a .ply, whatever its third scale, and its class ids."""
+    read = read_splat_file(path)
+    flat = replace(read.gaussians, log_scales=read.gaussians.log_scales[:, :2].contiguous())
+    return Surfels(**vars(flat)), read.class_ids
 
 
 def angles(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:

@@ -128,7 +128,7 @@ def test_gaussians_close_the_hole_and_are_its_only_new_ones():
     there = whole > 0
     assert ((depth(surfels) - whole)[there].abs() > 0.1).float().mean() > 0.4  # it shows its inside
     assert ((depth(both) - whole)[there].abs() > 0.05).float().mean() < 0.02
-    assert ((depth(both) > 0) != there).float().sum() < 0.06 * there.sum()  # and reaches hardly beyond
+    assert ((depth(both) > 0) != there).float().sum() < 0.06 * there.sum()  # It hardly reaches beyond.
 
 
 def test_gaussians_that_close_keep_clear_of_the_outline():

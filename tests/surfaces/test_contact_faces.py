@@ -144,10 +144,10 @@ def test_views_without_labels_say_nothing(monkeypatch):
     ("shown", "depth", "hidden", "open_"),
     [
         (BLOCK, 1.9, 1, 0),  # the neighbour, before the place
-        (BLOCK, 2.02, 0, 0),  # or just behind it, as far as depths may err
-        (BLOCK, 2.2, 0, 1),  # or behind it: one looks through
+        (BLOCK, 2.02, 0, 0),  # just behind it, within the error of depths
+        (BLOCK, 2.2, 0, 1),  # behind it: the view looks through
         (0, 1.9, 0, 1),  # the background before it
-        (0, 2.0, 0, 0),  # or at it: no one knows
+        (0, 2.0, 0, 0),  # at it: undecided
         (0, 0.0, 0, 1),  # nothing at all there
         (BOX, 1.9, 0, 0),  # its own object hides it
         (IGNORE, 1.9, 0, 0),
@@ -155,9 +155,9 @@ def test_views_without_labels_say_nothing(monkeypatch):
 )
 def test_what_a_view_says_of_a_place(shown, depth, hidden, open_):
     place = discs_on(box_mesh(0.8, 0.0))[:1]
-    place.means[:], place.quats[:] = 0.0, torch.tensor([1.0, 0.0, 0.0, 0.0])  # at the origin, facing up
+    place.means[:], place.quats[:] = 0.0, torch.tensor([1.0, 0.0, 0.0, 0.0])  # It faces up.
     witnesses = Witnesses(place, torch.tensor([BOX], dtype=torch.int32))
-    for eye in ((0.01, 0.0, 2.0), (0.01, 0.0, -2.0), (2.0, 0.0, 0.01)):  # from above, below and along it
+    for eye in ((0.01, 0.0, 2.0), (0.01, 0.0, -2.0), (2.0, 0.0, 0.01)):  # above, below, beside
         camera = camera_at(eye)
         size = camera.height, camera.width
         witnesses.add(camera, torch.full(size, shown, dtype=torch.int32), torch.full(size, depth))

@@ -86,7 +86,7 @@ def test_textures_do_not_depend_on_the_number_of_threads(box, photos, monkeypatc
         monkeypatch.setattr("scipy.sparse.linalg.lsmr", solve)
         with threadpool_limits(threads, "blas"):
             kept.append(fitted(mean, atlas, box, photos, np.ones((len(photos), 3))))
-    assert len(found[1]) == 4 and len(found[1][0]) > 20_000  # of fewer numbers BLAS makes no parts
+    assert len(found[1]) == 4 and len(found[1][0]) > 20_000  # BLAS splits only sums of this many numbers.
     assert all(np.array_equal(one, two) for one, two in zip(found[1], found[2], strict=True))
 
 
@@ -124,7 +124,7 @@ def test_a_picture_is_as_large_as_its_density_takes(box, photos):
     atlas = unwrapped(box, 4096, density)
     area = np.linalg.norm(area_vectors(box), axis=1).sum()
     assert 0.8**2 < len(texels(atlas).rows) / (density**2 * area) < 1.7**2
-    assert atlas.size & (atlas.size - 1) == 0  # as the validator of glTF would have it
+    assert atlas.size & (atlas.size - 1) == 0  # The validator of glTF demands a power of two.
     assert unwrapped(box, 128, 9 * density).size == 128  # no larger than it may be
     assert unwrapped(box, 4096, density / 100).size == 128
     texture = textured(box, photos, 0)

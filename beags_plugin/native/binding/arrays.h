@@ -8,27 +8,28 @@
 
 namespace beags {
 
-// The memory that holds a tensor.
+// The kind of memory that holds a tensor.
 enum class Memory { kCpu, kCuda };
 
-// A contiguous torch tensor. Its own methods are asked, which takes a tenth of the time of the DLPack protocol; this
-// counts where a call has tens of tensors and little to do. It holds no reference: the caller keeps the tensor alive.
+// A contiguous torch tensor. It reads the tensor's own attributes, which takes a tenth of the time of the DLPack
+// protocol; that matters for calls with tens of tensors and little work. It holds no reference: the caller keeps the
+// tensor alive.
 template <class T, Memory kMemory = Memory::kCpu>
 class Array {
  public:
-  T* data() const { return data_; }  // null for None and where there is no element
+  T* data() const { return data_; }  // null for None and for tensors without elements
   int64_t shape(int axis) const { return shape_[axis]; }
 
  private:
   friend struct nanobind::detail::type_caster<Array<T, kMemory>>;
   static constexpr int kAxes = 3;
   T* data_ = nullptr;
-  int64_t shape_[kAxes] = {};  // of the first axes
+  int64_t shape_[kAxes] = {};  // sizes of the first axes
 };
 
-using Ids = Array<const int32_t>;  // of classes
+using Ids = Array<const int32_t>;  // class ids
 
-// The attributes that are asked of a tensor; made at the first call, kept to the end of the process.
+// The attributes that are read from a tensor; made at the first call, never freed.
 struct TensorNames {
   PyObject *tensor, *data_ptr, *dtype, *is_cpu, *is_cuda, *is_contiguous,
       *shape;  // tensor: the class; the others: attributes
@@ -73,8 +74,8 @@ constexpr auto dtype_name() {
 namespace nanobind {
 namespace detail {
 
-// Accepts contiguous tensors of T in that memory; nanobind raises TypeError for others. An argument decides by itself
-// whether None is allowed. The emulated GPU uses the CPU's memory.
+// Accepts contiguous tensors of T in that memory; nanobind raises TypeError for others. Each argument states whether
+// None is allowed. The emulated GPU uses the CPU's memory.
 template <class T, beags::Memory kMemory>
 struct type_caster<beags::Array<T, kMemory>> {
 #if defined(BEAGS_CUDA_EMULATION)

@@ -193,7 +193,7 @@ void bind(nb::module_& m, const char* name) {
 }  // namespace beags
 
 NB_MODULE(_native, m) {
-  nb::set_leak_warnings(false);  // an image that is alive at exit keeps its frame, through autograd
+  nb::set_leak_warnings(false);  // An image that is alive at exit keeps its frame alive, through autograd.
   m.doc() = "The CPU rasterizer and the ops; use them through beags_plugin.rasterizers.native and beags_plugin.ops.";
   m.def("instruction_set", &beags::instruction_set, "The kernels in use; RuntimeError if those asked for cannot run.");
   m.def("instruction_sets", &beags::instruction_sets, "Those that can run here, best first.");

@@ -187,7 +187,7 @@ void bind_cuda(nb::module_& m) {
   m.attr("EMULATED") = true;
 #else
   m.attr("EMULATED") = false;
-  // In CUDA's numbering, 1000 major + 10 minor. Asking creates no context on a GPU.
+  // CUDA's numbering is 1000 major + 10 minor. The query creates no context on a GPU.
   m.def("driver_version", [] {
     int version = 0;
     check(cudaDriverGetVersion(&version), "asking for the driver's version");
@@ -196,7 +196,7 @@ void bind_cuda(nb::module_& m) {
   m.def("needed_driver_version", [] {
     int version = 0;
     check(cudaRuntimeGetVersion(&version), "asking for the runtime's version");
-#if defined(BEAGS_CUDA_PTX_ONLY)  // the driver compiles it
+#if defined(BEAGS_CUDA_PTX_ONLY)  // The driver compiles PTX.
     return version;
 #else
     return version / 1000 * 1000;

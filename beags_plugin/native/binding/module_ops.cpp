@@ -157,7 +157,7 @@ void bind_ops(nb::module_& m) {
       },
       "keys"_a, "classes"_a, "num_classes"_a, "origin"_a, "voxel_size"_a);
   lookup.def_prop_ro("bytes", &VoxelLookup::bytes);
-  lookup.def("tables", [](const VoxelLookup& self) {  // what ops/voxel_lookup.py copies to a GPU
+  lookup.def("tables", [](const VoxelLookup& self) {  // ops/voxel_lookup.py copies these to a GPU.
     nb::list out;
     const auto bytes = [](const auto& numbers) {
       return nb::bytes(reinterpret_cast<const char*>(numbers.data()), numbers.size() * sizeof numbers[0]);

@@ -64,7 +64,7 @@ namespace cuda {
 
 constexpr unsigned kWholeWarp = 0xFFFFFFFFu;
 constexpr int kWarpThreads = 32;
-constexpr int kBlockThreads = 256;  // of the kernels that take one item a thread
+constexpr int kBlockThreads = 256;  // threads of a block in kernels with one item per thread
 
 inline int64_t blocks_for(int64_t items, int threads = kBlockThreads) { return (items + threads - 1) / threads; }
 

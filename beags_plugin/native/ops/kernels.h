@@ -20,7 +20,7 @@ struct OccupancyJob {
   const VoxelTable* valid;  // [kLargestCube]: corners of cubes of 1, 2 and 3 valid voxels along each side
   T origin[3], voxel_size;
   uint64_t stream;  // hash of seed and step
-  bool skip;        // pass over discs that wholly lie in valid voxels; false: to see what that saves
+  bool skip;        // skip discs that wholly lie in valid voxels; false: to measure what that saves
   int64_t samples;
   bool background;
   double factor;                                           // 1 / (N Z)
@@ -54,7 +54,7 @@ struct CastJob {
   uint32_t* votes;  // [target_height, target_width, num_classes]
 };
 
-constexpr int kSsimWindow = 11, kSsimReach = kSsimWindow / 2;  // of SSIM, pixels
+constexpr int kSsimWindow = 11, kSsimReach = kSsimWindow / 2;  // window of SSIM, pixels
 constexpr int kChannels = 3;
 
 // L1 and SSIM of an image against a reference; see ops/photometric.py. Images are [H, W, 3], row-major.
@@ -64,13 +64,13 @@ struct PhotometricJob {
   const T *image, *reference;
   T window[kSsimWindow];
   T c1, c2;                // the constants of SSIM
-  T l1_scale, ssim_scale;  // of the gradient: of sum |x - y| and of the sum of the index
-  T* slopes;               // [3, H, W, 3] by blurred x, blurred x^2 + y^2, blurred x y; null: no gradient wanted
+  T l1_scale, ssim_scale;  // factors of the gradients of sum |x - y| and of the sum of the index
+  T* slopes;               // [3, H, W, 3] slopes of blurred x, blurred x^2 + y^2, blurred x y; null: no gradient wanted
   T* gradient;             // [H, W, 3]
   double* sums;            // [H, 2] sum of |x - y| and of the index, by row
 };
 
-// Sets the window: a Gaussian, sigma 1.5 pixels, of sum 1.
+// Sets the window: a Gaussian of sigma 1.5 pixels and sum 1.
 template <class T>
 void set_window(PhotometricJob<T>& job) {
   double window[kSsimWindow], total = 0;
@@ -85,8 +85,8 @@ struct NormalJob {
   int width, height;
   T fx_inverse, fy_inverse, skew, cx, cy;
   const T *depth, *normal, *alpha;
-  T scale;    // of the gradients
-  T* shares;  // [4, H, W] gradient by the depth of the right, left, lower and upper neighbour; null: no gradient
+  T scale;    // factor of the gradients
+  T* shares;  // [4, H, W] gradients of the depth of the right, left, lower and upper neighbour; null: no gradient
   T *g_depth, *g_normal;
   double* sums;  // [H] sum of A (1 - n . n_depth), by row
 };
@@ -110,7 +110,7 @@ struct OpKernels {
   void (*normal_gradient)(const NormalJob<T>& job, int row);
 };
 
-constexpr int64_t kTeamPixels = 16384;  // a team costs tens of microseconds, a pixel some ten nanoseconds
+constexpr int64_t kTeamPixels = 16384;  // A team costs tens of microseconds, a pixel some ten nanoseconds.
 
 // Returns how many threads share an image.
 inline int image_team(int width, int height, int threads) {

@@ -20,8 +20,8 @@ struct LiftedView {
 };
 
 constexpr int32_t kHalf = 1 << 20;  // voxels along each axis, to either side
-constexpr int32_t kMargin = 8;      // what is read about a point is in reach too
-constexpr int32_t kParts = 64;      // of a voxel, in interpolation weights
+constexpr int32_t kMargin = 8;      // margin for the voxels that are read around a point
+constexpr int32_t kParts = 64;      // steps per voxel of interpolation weights
 constexpr int kLook = 2;            // steps before and behind a point along its ray, where votes disagree
 
 BEAGS_HD inline uint64_t hash_of(uint64_t key) {
@@ -36,7 +36,7 @@ BEAGS_HD inline int32_t floor_of(T x) {
   return whole - (static_cast<T>(whole) > x);
 }
 
-// Returns the step along the ray of (px, py), in pixels, for one unit of depth; along one axis, in voxels.
+// Returns the step along one axis, in voxels, of the ray through (px, py), in pixels, for one unit of depth.
 template <class T>
 BEAGS_HD inline T ray_of(const LiftedView<T>& view, int axis, T px, T py) {
   const T* a = view.a + 3 * axis;
@@ -45,7 +45,7 @@ BEAGS_HD inline T ray_of(const LiftedView<T>& view, int axis, T px, T py) {
 
 template <class T>
 BEAGS_HD inline bool in_reach(T coordinate) {
-  return fabs(coordinate) < static_cast<T>(kHalf - kMargin);  // false for NaN
+  return fabs(coordinate) < static_cast<T>(kHalf - kMargin);  // The comparison is false for NaN.
 }
 
 // Computes a pixel's point and the step along its ray, on GPUs; the CPU has `LiftedTile`. Returns false without a
@@ -63,7 +63,8 @@ BEAGS_HD inline bool lift(const LiftedView<T>& view, int x, int y, T* point, T* 
   return near;
 }
 
-// The eight voxels about a point, from `corner`. fraction: of kParts, from the middle of the first to the second.
+// The eight voxels around a point, from `corner`. fraction: position between the centres of the first and the second,
+// in units of 1 / kParts.
 struct NearVoxels {
   int32_t corner[3], fraction[3];
 };

@@ -9,8 +9,8 @@ namespace beags {
 namespace ops {
 namespace BEAGS_ISA {
 
-// Returns the error of the pixels from `at` = (x, y) on. Writes their gradients by the rendered normal, and by their
-// four neighbours' depths into `shares`. x: one number in each lane.
+// Returns the error of the pixels from `at` = (x, y) on. Writes the gradients of their rendered normals, and those of
+// their four neighbours' depths into `shares`. x: one number in each lane.
 template <class T, class Where>
 BEAGS_INLINE RealOf<T> normal_error(const NormalJob<T>& job, int64_t at, RealOf<T> x, int y, Where lanes) {
   using R = RealOf<T>;
@@ -37,7 +37,7 @@ BEAGS_INLINE RealOf<T> normal_error(const NormalJob<T>& job, int64_t at, RealOf<
   return terms.error;
 }
 
-// Writes the zeros of a pixel on the image's border, which has no error.
+// Writes zeros for a pixel on the image's border, which has no error.
 template <class T>
 BEAGS_INLINE void normal_border(const NormalJob<T>& job, int64_t at) {
   if (!job.shares) return;
@@ -68,7 +68,7 @@ void normal(const NormalJob<T>& job, int y) {
   job.sums[y] = total;
 }
 
-// Computes row `y` of the gradient by depth.
+// Computes row `y` of the gradient of the depth.
 template <class T>
 void normal_gradient(const NormalJob<T>& job, int y) {
   const int64_t start = static_cast<int64_t>(y) * job.width;

@@ -53,8 +53,8 @@ struct Depths {
   R center, right, left, lower, upper;
 };
 
-// The error and its gradients, times job.scale: by the depth of the right, left, lower and upper neighbour (that by the
-// pixel's own depth is 0), and by the rendered normal.
+// The error and its gradients, times job.scale: of the depth of the right, left, lower and upper neighbour (that of the
+// pixel's own depth is 0), and of the rendered normal.
 template <class R>
 struct NormalTerms {
   R error, shares[4];
@@ -75,12 +75,12 @@ BEAGS_HD_INLINE NormalTerms<R> normal_terms(const NormalJob<T>& job, R x, int y,
   const auto down = times(inverse, minus(times(d.lower, to_lower), times(d.upper, to_upper)));
   const auto product = cross(down, across);
   const R squared = dot(product, product);
-  known &= squared > kTiny<T>;                                            // false for NaN
-  const R turn = select(dot(product, ray(job, x, y)) > zero, -one, one);  // towards the camera
+  known &= squared > kTiny<T>;                                            // The comparison is false for NaN.
+  const R turn = select(dot(product, ray(job, x, y)) > zero, -one, one);  // The normal shall face the camera.
   const R length_inverse = turn / sqrt(select(known, squared, one));
   const auto slope = times(length_inverse, product);
   const R agreement = dot(n, slope), weight = select(known, job.scale * alpha, zero);
-  // d(n . slope) by the unnormalised product is (n - slope (n . slope)) / length.
+  // The gradient of n . slope in the unnormalised product is (n - slope (n . slope)) / length.
   const auto g = times(-weight * length_inverse, minus(n, times(agreement, slope)));
   const auto g_across = times(inverse, cross(g, down)), g_down = times(inverse, cross(across, g));
   return {select(known, alpha * (one - agreement), zero),
@@ -90,7 +90,7 @@ BEAGS_HD_INLINE NormalTerms<R> normal_terms(const NormalJob<T>& job, R x, int y,
            select(known, -weight * slope.z, zero)}};
 }
 
-// Returns the gradient by the depth of pixel number `at`. Determinism: it is gathered from the neighbours, in a fixed
+// Returns the gradient of the depth of pixel number `at`. Determinism: it is gathered from the neighbours, in a fixed
 // order.
 template <class T>
 BEAGS_HD_INLINE T gathered_shares(const NormalJob<T>& job, int64_t at) {

@@ -15,11 +15,11 @@ namespace ops {
 namespace BEAGS_ISA {
 
 constexpr int kFarOff = 1 << 20;  // size of a box that cannot be looked up
-// The memory in which a batch's samples are looked up: registers, for discs within 4 x 4 x 4 voxels; a window of bricks
-// for each disc; the table, for large discs and for those far from all voxels.
+// The memory in which a batch's samples are looked up: registers for discs within 4 x 4 x 4 voxels; a window of bricks
+// per disc; the table for large discs and for discs far from all voxels.
 enum class Reach { kNear, kWindow, kFar };
 
-// A batch: one Gaussian a lane, ready to be sampled.
+// A batch of Gaussians to be sampled, one per lane.
 template <class T>
 struct OccupancyBatch {
   // Corner of the voxels around the disc, and which of them are valid: two words of 32 bits, or 3 x 3 x 3 bricks.
@@ -42,8 +42,8 @@ BEAGS_INLINE void store(T* to, typename Lanes<T>::Real vector) {
   __builtin_memcpy(to, &vector, sizeof vector);
 }
 
-// The voxels that a batch's discs reach: `size` voxels along each axis, from `low`; at most `largest`, which is more
-// than any window holds if a disc is too far away to be looked up.
+// The voxels that a batch's discs reach: `size` voxels along each axis, from `low`; `largest` is the largest size, or
+// larger than any window if a disc is too far away to be looked up.
 template <class T>
 struct Boxes {
   typename Lanes<T>::Int low[3], size[3], largest;
@@ -130,7 +130,7 @@ BEAGS_INLINE Boxes<T> boxes_around(const Discs<T>& discs) {
   for (int axis = 0; axis < 3; ++axis) {
     const R center = discs.center[axis], size = select(center < zero, -center, center);
     const R half = reach_along<T>(discs.axis_u[axis], discs.axis_v[axis], size);
-    const auto near = size + half < static_cast<T>(kVoxelHalf);  // others, and NaN, have no whole numbers
+    const auto near = size + half < static_cast<T>(kVoxelHalf);  // Other values, and NaN, have no whole numbers.
     boxes.low[axis] = floor_to_int(select(near, center - half, zero));
     boxes.size[axis] = floor_to_int(select(near, center + half, zero)) - boxes.low[axis] + 1;
     const auto seen = select(near, boxes.size[axis], far_off);
@@ -171,7 +171,7 @@ BEAGS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& batch)
   using R = typename Lanes<T>::Real;
   using I = typename Lanes<T>::Int;
   constexpr int kCount = Lanes<T>::kCount;
-  for (int lane = batch.count; lane < kCount; ++lane) {  // fill up with copies
+  for (int lane = batch.count; lane < kCount; ++lane) {  // Copies fill the spare lanes.
     for (auto& low : batch.low) low[lane] = low[0];
     for (auto& valid : batch.valid) valid[lane] = valid[0];
     if (kReach == Reach::kWindow) __builtin_memcpy(batch.bricks[lane], batch.bricks[0], sizeof batch.bricks[0]);
@@ -193,7 +193,7 @@ BEAGS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& batch)
   for (int64_t s = 0; s < job.samples; ++s) {
     I radial, angle;
     counter.next(radial, angle);
-    const R area = to_real(radial) * T(1.0 / (1 << 24));  // (r / 3)^2: grows with the square of the radius
+    const R area = to_real(radial) * T(1.0 / (1 << 24));  // (r / 3)^2: area grows with the square of the radius
     const R radius = T(3) * sqrt(area);
     R u, v;
     cos_sin(angle, u, v);
@@ -303,7 +303,7 @@ BEAGS_INLINE unsigned in_cubes(const VoxelTable* cubes, const Boxes<T>& boxes, c
   const uint64_t none = 0;
   const uint64_t* const tables[] = {&none, cubes[0].dense, cubes[1].dense, cubes[2].dense};
   const I table = boxes.largest & counted;
-  Whole tables_at[kCount], offsets[kCount], places[kCount];  // single lanes are quicker to read from memory
+  Whole tables_at[kCount], offsets[kCount], places[kCount];  // Single lanes are read faster from memory.
   __builtin_memcpy(tables_at, &table, sizeof table);
   __builtin_memcpy(offsets, &offset, sizeof offset);
   __builtin_memcpy(places, &place, sizeof place);
@@ -350,7 +350,7 @@ double occupancy_block(const OccupancyJob<T>& job, int64_t first, int64_t last, 
       const int32_t class_id = class_ids[lane];
       if (broken[lane] != broken[lane] || (!job.background && class_id == 0)) continue;
       int64_t low[3] = {};
-      if (class_id < 0 || class_id >= job.valid->num_classes) {  // it has no voxels, wherever it lies
+      if (class_id < 0 || class_id >= job.valid->num_classes) {  // The class has no voxels.
         waiting.template add<Reach::kNear>(i, low, 0);
         continue;
       }

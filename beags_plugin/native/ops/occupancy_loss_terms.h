@@ -52,7 +52,7 @@ BEAGS_HD_INLINE R reach_along(R u, R v, R distance) {
   return T(3) * sqrt(u * u + v * v) * (1 + 16 * kEpsilon) + 16 * kEpsilon * distance;
 }
 
-// Adds a sample outside the valid voxels to the six sums: of G Q times 1, u, v, u^2, v^2, u v. weight: G Q, or 0.
+// Adds a sample outside the valid voxels to the six sums of G Q times 1, u, v, u^2, v^2, u v. weight: G Q, or 0.
 template <class R>
 BEAGS_HD_INLINE void add_sample(R weight, R u, R v, R* sums) {
   const R wu = weight * u, wv = weight * v;
@@ -64,8 +64,8 @@ BEAGS_HD_INLINE void add_sample(R weight, R u, R v, R* sums) {
   sums[5] = fma(wu, v, sums[5]);
 }
 
-// Computes the gradients by mean [3], quaternion [4], log scales [2] and opacity logit, in that order. sums: of G Q
-// times 1, u, v, u^2, v^2, u v.
+// Computes the gradients of mean [3], quaternion [4], log scales [2] and opacity logit, in that order. sums: those of
+// G Q times 1, u, v, u^2, v^2, u v.
 template <class T, class R>
 BEAGS_HD_INLINE void disc_gradients(const OccupancyJob<T>& job, const DiscFrame<R>& f, R opacity, const R* sums,
                                     R* out) {

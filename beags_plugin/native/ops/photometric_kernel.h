@@ -10,7 +10,7 @@ namespace beags {
 namespace ops {
 namespace BEAGS_ISA {
 
-constexpr int kPad = kSsimReach * kChannels;  // numbers beyond a row's ends that the window reaches, held at 0
+constexpr int kPad = kSsimReach * kChannels;  // numbers beyond a row's ends that the window reaches; they are 0
 
 // Returns how many numbers one buffer of a row has.
 template <class T>

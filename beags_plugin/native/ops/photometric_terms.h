@@ -15,7 +15,7 @@ namespace BEAGS_ISA {
 
 template <class R>
 struct SsimTerms {
-  R index, by_mean, by_squares, by_product;  // the index, and its slopes by blurred x, x^2 + y^2 and x y
+  R index, by_mean, by_squares, by_product;  // the index, and its slopes in blurred x, x^2 + y^2 and x y
 };
 
 // m_x, m_y, squares, product: blurred x, y, x^2 + y^2, x y.

@@ -18,7 +18,7 @@ struct VotingView {
   int height, width;
   const T* depth;
   const int32_t* labels;        // null: no mask, or
-  const uint8_t* short_labels;  // one of a byte a pixel, in which kShortIgnore does not vote; null: none
+  const uint8_t* short_labels;  // labels of a byte per pixel, in which kShortIgnore does not vote; null: none
 };
 
 constexpr uint8_t kShortIgnore = 255;

@@ -25,9 +25,9 @@ void cast_row(const CastJob<T>& job, int y, const T* depth, const int32_t* label
     const Projected<R> to = project_pixel<T, R>(job, x, row, d);
     const I lands = lands_in_target<T, R>(job, to, d);
     I column = to_int(select(lands, to.hx / to.z, zero)), line = to_int(select(lands, to.hy / to.z, zero));
-    column += column == job.target_width;  // the quotient may round up to the border itself
+    column += column == job.target_width;  // The quotient may round up to the border itself.
     line += line == job.target_height;
-    typename Lanes<T>::Whole pixel[kCount];  // of the target, or -1
+    typename Lanes<T>::Whole pixel[kCount];  // pixel of the target, or -1
     T depth_there[kCount];
     const I at = (line * job.target_width + column) | ~lands;
     __builtin_memcpy(pixel, &at, sizeof pixel);

@@ -1,6 +1,6 @@
 // Computes a pixel's vote in another view, and the winner of the votes for a pixel (method, section 2; E5), for the
 // vectors of CPUs and the threads of GPUs. Each operation is rounded as in masks/reprojection.py (no fused operations),
-// so that all give the same votes. Included once for each instruction set, or for GPUs.
+// hence all give the same votes. Included once for each instruction set, or for GPUs.
 #pragma once
 
 #include "ops/kernels.h"
@@ -10,8 +10,8 @@ namespace beags {
 namespace ops {
 namespace BEAGS_ISA {
 
-// The projection z (x', y', 1) of a pixel, whose middle is x and the middle of its row, at depth d. R: T, or a vector
-// of T.
+// The projection z (x', y', 1) of a pixel at depth d; its centre is x and the centre of its row. R: T, or a vector of
+// T.
 template <class R>
 struct Projected {
   R hx, hy, z;
@@ -24,7 +24,7 @@ BEAGS_HD_INLINE Projected<R> project_pixel(const CastJob<T>& job, R x, T y, R d)
           d * (a[6] * x + (a[7] * y + a[8])) + job.b[2]};
 }
 
-// Returns whether that is a pixel of the target. Products instead of quotients: z = 0, infinite and NaN points simply
+// Returns whether that is a pixel of the target. With products instead of quotients, z = 0, infinite and NaN points
 // fail.
 template <class T, class R>
 BEAGS_HD_INLINE auto lands_in_target(const CastJob<T>& job, const Projected<R>& at, R d) {

@@ -11,7 +11,7 @@ namespace {
 template <class T>
 void run(void (*kernel)(const ColorJob<T>&, int64_t, int64_t), const ColorJob<T>& job, int64_t count, int threads) {
   const int64_t blocks = (count + kColorBlock - 1) / kColorBlock;
-  const int team = count < 8000 ? 1 : threads;  // a Gaussian takes some ten nanoseconds, a team tens of microseconds
+  const int team = count < 8000 ? 1 : threads;  // A Gaussian takes some ten nanoseconds, a team tens of microseconds.
 #pragma omp parallel for num_threads(team) schedule(static)
   for (int64_t block = 0; block < blocks; ++block) {
     kernel(job, block * kColorBlock, std::min((block + 1) * kColorBlock, count));

@@ -61,7 +61,7 @@ void colors_of_degree(const ColorJob<T>& job, int64_t first, int64_t last) {
     for (int c = 0; c < 3; ++c) {
       const T value = sum[c] + T(0.5);
       clamped |= static_cast<uint8_t>((value < 0) << c);
-      job.colors[3 * (first + i) + c] = value < 0 ? T(0) : value;  // NaN stays
+      job.colors[3 * (first + i) + c] = value < 0 ? T(0) : value;  // NaN remains NaN.
     }
     job.clamped[first + i] = clamped;
   }
@@ -91,7 +91,7 @@ void colors_backward_of_degree(const ColorJob<T>& job, int64_t first, int64_t la
     }
     if (kDegree > 0 && job.g_means) {
       const T* rest = job.rest + row * job.num_rest * 3;
-      for (int k = 1; k < kBases; ++k) {  // the first function is constant
+      for (int k = 1; k < kBases; ++k) {  // The first function is constant.
         const T* sh = rest + 3 * (k - 1);
         g_basis[k][i] = g[0] * sh[0] + g[1] * sh[1] + g[2] * sh[2];
       }

@@ -15,7 +15,7 @@ constexpr double kC0 = 0.28209479177387814, kC1 = 0.4886025119029199;
 constexpr double kC20 = 1.0925484305920792, kC21 = 0.31539156525252005, kC22 = 0.5462742152960396;
 constexpr double kC30 = 0.5900435899266435, kC31 = 2.890611442640554, kC32 = 0.4570457994644658,
                  kC33 = 0.3731763325901154, kC34 = 1.445305721320277;
-constexpr double kLeastDistance = 1e-12;  // a Gaussian at the camera
+constexpr double kLeastDistance = 1e-12;  // for a Gaussian at the camera
 
 template <class T>
 struct Direction {
@@ -64,7 +64,7 @@ struct DirectionGradient {
   T x, y, z;
 };
 
-// Adds the part of degree kDegree (1 or more) to the gradient by the direction. g(k): the gradient by function k of the
+// Adds the part of degree kDegree (1 or more) to the gradient of the direction. g(k): the gradient of function k of the
 // basis.
 template <int kDegree, class T, class Get>
 BEAGS_HD_INLINE DirectionGradient<T> basis_backward(const Direction<T>& d, Get g) {
@@ -84,7 +84,7 @@ BEAGS_HD_INLINE DirectionGradient<T> basis_backward(const Direction<T>& d, Get g
               T(kC34) * (xx - yy) * g(14)};
 }
 
-// Computes the gradient by a mean, to[3]: d = p / |p|; at the camera |p| is held at its least.
+// Computes the gradient of a mean, to[3]: d = p / |p|, where |p| is at least kLeastDistance.
 template <class T>
 BEAGS_HD_INLINE void to_mean(const Direction<T>& d, const DirectionGradient<T>& g, T* to) {
   T along = g.x * d.x + g.y * d.y + g.z * d.z;

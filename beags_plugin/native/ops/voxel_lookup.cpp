@@ -9,10 +9,10 @@ namespace ops {
 using namespace BEAGS_ISA;
 namespace {
 
-// An array of bricks has at most kMostDense cells, or kDensePerBrick for each brick that is not empty if that is more.
-// A hash table has 4 to 8 a brick.
+// An array of bricks has at most kMostDense cells, or kDensePerBrick per non-empty brick if that is more. A hash table
+// has 4 to 8 cells per brick.
 constexpr double kMostDense = 1 << 16, kDensePerBrick = 16;
-constexpr int64_t kLeastForTeam = 4000;  // queries take tens of nanoseconds; a team takes microseconds to start
+constexpr int64_t kLeastForTeam = 4000;  // Queries take tens of nanoseconds; a team takes microseconds to start.
 
 // Sorts by key and unites the bits of equal keys.
 void unite(std::vector<Brick>& bricks) {
@@ -118,7 +118,7 @@ void VoxelLookup::Bricks::hash(const std::vector<std::vector<Brick>>& bricks) {
   uint64_t first = 0;
   for (const std::vector<Brick>& of_class : bricks) {
     int bits = 1;
-    while ((uint64_t(1) << bits) < 2 * of_class.size()) ++bits;  // at most half full: short chains
+    while ((uint64_t(1) << bits) < 2 * of_class.size()) ++bits;  // Tables at most half full have short chains.
     ranges.push_back({first, (uint64_t(1) << bits) - 1, 64 - bits});
     first += uint64_t(1) << bits;
   }
@@ -163,7 +163,7 @@ VoxelLookup::VoxelLookup(const int64_t* keys, const int32_t* classes, int64_t co
     const uint64_t bit = uint64_t(1) << (16 * (voxel[0] & 3) + 4 * (voxel[1] & 3) + (voxel[2] & 3));
     occupied[c].push_back({brick_key(voxel[0] >> 2, voxel[1] >> 2, voxel[2] >> 2), bit});
     add_neighbours(voxel, valid[c]);
-    if (valid[c].size() >= unite_at[c]) {  // keep memory linear in the bricks, not in the voxels
+    if (valid[c].size() >= unite_at[c]) {  // Memory stays linear in the bricks, not in the voxels.
       unite(occupied[c]);
       unite(valid[c]);
       unite_at[c] = std::max<size_t>(1 << 16, 2 * valid[c].size());
@@ -193,7 +193,7 @@ int64_t VoxelLookup::bytes() const {
   return sum;
 }
 
-// As VisibilityGrid's _scaled: each step is monotonic.
+// Each step is monotonic, as in VisibilityGrid's _scaled.
 template <class T>
 void VoxelLookup::scaled(const T* point, T* voxel) const {
   for (int axis = 0; axis < 3; ++axis) {
@@ -236,7 +236,7 @@ template <class T>
 void VoxelLookup::disc_inside(int64_t count, const T* means, const T* axes_u, const T* axes_v, const int32_t* class_ids,
                               bool* out, int threads) const {
   const VoxelTable table = valid();
-  const T rounding = 16 * std::numeric_limits<T>::epsilon();  // as VisibilityGrid's disc_inside
+  const T rounding = 16 * std::numeric_limits<T>::epsilon();  // the margin of VisibilityGrid's disc_inside
   const int team = count < kLeastForTeam ? 1 : threads;
 #pragma omp parallel for num_threads(team) schedule(static)
   for (int64_t i = 0; i < count; ++i) {

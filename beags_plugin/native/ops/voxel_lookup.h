@@ -1,5 +1,5 @@
-// Looks up points in the visibility voxel grids: two sets of bricks, of the occupied voxels and of the valid ones, next
-// to an occupied one (method, section 5). Built once; queries are safe from any thread.
+// Looks up points in the visibility voxel grids: two sets of bricks hold the occupied voxels, and the valid ones next
+// to an occupied one (method, section 5). They are built once; queries are safe from any thread.
 #pragma once
 
 #include <array>
@@ -22,7 +22,7 @@ class VoxelLookup {
     std::vector<Brick> slots;
     std::vector<BrickRange> ranges;
     int32_t num_classes;
-    // bricks: those of each class, all different.
+    // bricks: those of each class, all distinct.
     void store(const std::vector<std::vector<Brick>>& bricks);
     void hash(const std::vector<std::vector<Brick>>& bricks);
     VoxelTable table() const;

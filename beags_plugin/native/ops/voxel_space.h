@@ -10,7 +10,7 @@
 namespace beags {
 namespace ops {
 
-constexpr int kTile = 8;  // pixels are taken in tiles: neighbours mostly need the same bricks
+constexpr int kTile = 8;  // side of a tile of pixels: neighbours mostly need the same bricks
 
 inline uint64_t brick_key(int32_t x, int32_t y, int32_t z) {
   return static_cast<uint64_t>(x) << 38 | static_cast<uint64_t>(y) << 19 | static_cast<uint64_t>(z);
@@ -22,8 +22,8 @@ inline uint64_t place_of(uint64_t key) {
   const uint64_t within = (key >> 36 & 4) | (key >> 18 & 2) | (key & 1);
   return (hash_of(key & ~odd) & ~uint64_t(7)) | within;
 }
-constexpr uint64_t kNextPlace = 9;  // odd: all slots are reached
-// The cache of bricks needed last. Those of a cube of 16 bricks' side have places of their own.
+constexpr uint64_t kNextPlace = 9;  // An odd step reaches all slots.
+// The cache of the bricks needed last. All bricks of a cube with a side of 16 bricks have distinct places.
 constexpr int kKept = 1 << 12;
 inline int kept_at(uint64_t key) { return static_cast<int>((key & 15) | (key >> 15 & 0xf0) | (key >> 30 & 0xf00)); }
 // Returns a voxel's place in its brick.
@@ -45,8 +45,8 @@ void each_tile(const LiftedView<T>& view, int row, DoTile do_tile) {
   for (int left = 0; left < view.width; left += kTile) do_tile(left, std::min(left + kTile, view.width), top, bottom);
 }
 
-// The results of `lift` for a tile's pixels, and the voxels of their points, at 8 (y - top) + x - left. Plain loops
-// over whole arrays let the compiler vectorise. Pixels outside the image are not near.
+// The results of `lift` for a tile's pixels, and the voxels of their points, at 8 (y - top) + x - left. Compilers
+// vectorise plain loops over whole arrays. Pixels outside the image are not near.
 template <class T>
 struct LiftedTile {
   static constexpr int kPlaces = kTile * kTile;

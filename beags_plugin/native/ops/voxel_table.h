@@ -13,7 +13,7 @@ namespace beags {
 namespace ops {
 
 constexpr int64_t kVoxelHalf = int64_t(1) << 20;  // occupied voxels lie in -kVoxelHalf .. kVoxelHalf - 1
-constexpr int64_t kVoxelShift = kVoxelHalf + 8;   // added to an index before it is cut into brick and place
+constexpr int64_t kVoxelShift = kVoxelHalf + 8;   // added to an index before it is split into brick and place
 constexpr int kLargestCube = 3;                   // see VoxelLookup
 constexpr uint64_t kNoBrick = ~uint64_t(0);       // key of an empty slot; bricks use 60 bits
 
@@ -30,7 +30,7 @@ struct BrickRange {
 struct VoxelTable {
   int32_t num_classes;
   // The array [num_classes, size[0], size[1], size[2]] of bits, or null. Its first brick is `base`; along each axis its
-  // first two and last two bricks are empty, so that what lies outside can be moved there.
+  // first two and last two bricks are empty, so that voxels outside can be moved there.
   const uint64_t* dense;
   int32_t base[3], size[3];
   // The hash table, where there is no array.
@@ -125,7 +125,7 @@ BEAGS_HD inline uint64_t voxel_box(const VoxelTable& table, int32_t class_id, co
 }
 
 constexpr int kWindow = 3;                      // bricks along each side of a window
-constexpr int kWindowVoxels = 4 * kWindow - 3;  // a box of that side lies in a window, wherever it starts
+constexpr int kWindowVoxels = 4 * kWindow - 3;  // A box of that side always lies in a window.
 
 // Copies the bricks that the box of sizes n[] in 1 .. kWindowVoxels from voxel low[] on reaches, and moves low[] to the
 // first voxel of the first one. Returns whether the box wholly lies in the set.
@@ -208,7 +208,7 @@ template <class T>
 BEAGS_HD inline bool small_box(const T* low, const T* high, int64_t* from, int* n) {
   const T limit = static_cast<T>(kVoxelHalf + 1);
   for (int axis = 0; axis < 3; ++axis) {
-    if (!(high[axis] - low[axis] <= 3 && fabs(low[axis]) <= limit)) return false;  // false for NaN
+    if (!(high[axis] - low[axis] <= 3 && fabs(low[axis]) <= limit)) return false;  // The comparison is false for NaN.
     from[axis] = static_cast<int64_t>(low[axis]);
     n[axis] = static_cast<int>(high[axis] - low[axis]) + 1;
   }

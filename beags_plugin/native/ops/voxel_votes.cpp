@@ -9,13 +9,13 @@ namespace beags {
 namespace ops {
 namespace {
 
-constexpr uint64_t kNowhere = ~uint64_t(0);  // pixels without a depth, or too far away
+constexpr uint64_t kNowhere = ~uint64_t(0);  // key of pixels without a depth, or too far away
 constexpr int kShares = 64;
 constexpr int kBlock = 64;                                       // voxels that are fetched at a time
-constexpr uint32_t kPrimes[3] = {73856093, 19349663, 83492791};  // as in masks/spatial_chunks.py
+constexpr uint32_t kPrimes[3] = {73856093, 19349663, 83492791};  // the same numbers as in masks/spatial_chunks.py
 
-// Combines three bricks in a row along an axis into bits of the middle one: set there or in the next voxel below, or
-// above.
+// Combines three bricks in a row along an axis into bits of the middle one: a bit is set if it is set there, or in the
+// next voxel below or above.
 void with_next(int axis, const uint64_t* bricks, uint64_t* below, uint64_t* above) {
   const uint64_t first = kPlane[axis], last = first << 3 * kShift[axis], own = bricks[1];
   const int shift = kShift[axis];
@@ -60,7 +60,7 @@ void VoxelVotes::add(const LiftedView<T>& view, const int32_t* labels, int32_t i
     const uint64_t first = kShares * part / team, last = kShares * (part + 1) / team;
     struct Kept {
       uint64_t key = kNowhere;
-      Share* share = nullptr;  // null: another thread's
+      Share* share = nullptr;  // null: it belongs to another thread
       Voxel* voxels = nullptr;
       int32_t brick = 0;
     };
@@ -178,7 +178,7 @@ void VoxelVotes::Share::decide() {
       total += extras[i].votes;
       if (extras[i].votes > most.votes) {
         most = pairs.back();
-        std::swap(pairs.back(), pairs[first + 1]);  // the first that is looked at
+        std::swap(pairs.back(), pairs[first + 1]);  // It is the first to be read.
       }
     }
     pairs[first] = {static_cast<int32_t>(pairs.size() - first - 1), total};
@@ -236,7 +236,7 @@ void VoxelVotes::fetch(uint64_t key) const {
 
 void VoxelVotes::settle(uint64_t key, Brick& brick) const {
   if (!brick.led) return;
-  uint64_t against[27] = {};  // voxels of the bricks about it that do not agree
+  uint64_t against[27] = {};  // voxels of the surrounding bricks that disagree
   for (int side = 0; side < 27; ++side) {
     const int step[3] = {side / 9 - 1, side / 3 % 3 - 1, side % 3 - 1};
     uint64_t touched = brick.led;
@@ -251,7 +251,7 @@ void VoxelVotes::settle(uint64_t key, Brick& brick) const {
                                            static_cast<uint64_t>(static_cast<int64_t>(step[2])));
     if (other) against[side] = other->label == brick.label ? other->voted & ~other->led : other->voted;
   }
-  // Axis by axis: the bits of the voxel or of the next one, below ([0]) and above ([1]).
+  // Axis by axis, combines the bits of a voxel and of the next one, below ([0]) and above ([1]).
   uint64_t by_z[2][9], by_yz[2][2][3];
   for (int i = 0; i < 9; ++i) with_next(2, against + 3 * i, &by_z[0][i], &by_z[1][i]);
   for (int z = 0; z < 2; ++z) {

@@ -20,14 +20,14 @@ class VoxelVotes {
   void add(const LiftedView<T>& view, const int32_t* labels, int32_t ignore);
   // Ends the counting.
   void decide();
-  // Sets, after `decide`, the winner of the votes about each pixel with a depth, and its share; a tie or no vote keeps
+  // Sets, after `decide`, the winner of the votes around each pixel with a depth, and its share; a tie or no vote keeps
   // the label.
   template <class T>
   void read(const LiftedView<T>& view, int32_t* labels, float* confidence) const;
 
  private:
   static constexpr int kCells = 64;                   // a brick is 4 x 4 x 4 voxels
-  static constexpr int32_t kNobody = -2, kMany = -1;  // instead of a leading class
+  static constexpr int32_t kNobody = -2, kMany = -1;  // values in place of a leading class
 
   // While counting: one class and its votes; 0 votes: an empty voxel. Further classes are `Extra`s. After `decide`:
   // label has more than half of the votes, or is -1; with several classes, votes is kSeveral and the place of their
@@ -42,21 +42,21 @@ class VoxelVotes {
     int32_t label;
     uint32_t votes;  // 0: empty
   };
-  struct Pair {  // one class of a voxel; before them: how many there are, and all votes
+  struct Pair {  // one class of a voxel; before a voxel's pairs: their number, and all votes
     int32_t label;
     uint32_t votes;
   };
   struct alignas(64) Brick {
     // After `decide`, a bit for each voxel. Of the class `label`: more than half of the voxel's votes and of those of
-    // all that have any among the eight voxels about a point in it, by the eighth of the voxel that holds the point
+    // all that have any among the eight voxels around a point in it, by the eighth of the voxel that holds the point
     // (bits 4, 2, 1: the upper half along x, y, z).
     uint64_t agreed[8] = {};
-    uint64_t pure = 0;   // votes for `label` and no others
-    uint64_t voted = 0;  // any votes
-    uint64_t led = 0;    // more than half of the votes for `label`
+    uint64_t pure = 0;   // voxels with votes for `label` alone
+    uint64_t voted = 0;  // voxels with votes
+    uint64_t led = 0;    // voxels with more than half of the votes for `label`
     int32_t label = 0;
     std::unique_ptr<Voxel[]> voxels;  // [64], x slowest
-    const Pair* pairs = nullptr;      // of its share; after `decide`
+    const Pair* pairs = nullptr;      // pairs of its share; set by `decide`
   };
   struct Slot {
     uint64_t key;
@@ -80,7 +80,7 @@ class VoxelVotes {
   };
   class Reader;
   const Brick* find(uint64_t key) const;
-  void fetch(uint64_t key) const;  // what `find` will look at first
+  void fetch(uint64_t key) const;  // prefetches what `find` reads first
   void settle(uint64_t key, Brick& brick) const;
 
   int threads_;
@@ -89,8 +89,8 @@ class VoxelVotes {
   std::vector<int32_t> labels_;
 };
 
-// Returns about one in `part`, a power of two, of the bricks of 4 x 4 x 4 voxels that hold the view's points, the same
-// in every view: x, y, z of each, sorted.
+// Returns about one in `part`, a power of two, of the bricks of 4 x 4 x 4 voxels that hold the view's points: x, y, z
+// of each, sorted. All views choose the same bricks.
 template <class T>
 std::vector<int32_t> brick_sample(const LiftedView<T>& view, uint32_t part);
 

@@ -11,8 +11,8 @@ class VoxelVotes::Reader {
  public:
   explicit Reader(const VoxelVotes& votes) : votes_(votes), kept_(kKept) {}
 
-  // Sets labels and confidence. All memory that the pixels of a tile will read is fetched first, so that no pixel waits
-  // alone.
+  // Sets labels and confidence. The memory that the pixels of a tile read is prefetched together, so that they wait
+  // once.
   template <class T>
   void read(const LiftedView<T>& view, int left, int right, int top, int bottom, int32_t* labels, float* confidence) {
     const LiftedTile<T> tile(view, left, right, top, bottom);
@@ -118,8 +118,8 @@ class VoxelVotes::Reader {
     uint64_t votes;
   };
 
-  // Eight voxels about a point, and their bricks, one to eight of them, by bits 4, 2, 1 for one step along x, y, z; the
-  // other bricks are not read.
+  // Eight voxels around a point, and their bricks, one to eight of them, by bits 4, 2, 1 for one step along x, y, z;
+  // the other bricks are not read.
   struct Look {
     NearVoxels place;
     const Brick* bricks[8];
@@ -142,7 +142,7 @@ class VoxelVotes::Reader {
     }
   }
 
-  // Moves that many steps along the pixel's ray. Its voxels are fetched now and read after others.
+  // Moves that many steps along the pixel's ray. Its voxels are prefetched now and read later.
   template <class T>
   void look_along(const LiftedView<T>& view, const Query<T>& query, int steps, Look& look) {
     const T px = static_cast<T>(query.pixel % view.width) + T(0.5);
@@ -163,7 +163,7 @@ class VoxelVotes::Reader {
     return kept.brick;
   }
 
-  // Calls do_voxel(brick, voxel, weight) for those of the eight voxels that have votes.
+  // Calls do_voxel(brick, voxel, weight) for each of the eight voxels that has votes.
   template <class DoVoxel>
   static void each_voxel(const Look& look, DoVoxel do_voxel) {
     const NearVoxels& place = look.place;
@@ -245,7 +245,7 @@ class VoxelVotes::Reader {
 
   const VoxelVotes& votes_;
   std::vector<Kept> kept_;
-  const Brick nothing_;  // where nobody voted
+  const Brick nothing_;  // the brick of voxels without votes
   std::vector<Entry> poll_;
 };
 

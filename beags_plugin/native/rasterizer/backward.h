@@ -11,11 +11,11 @@ namespace BEAGS_ISA {
 // The backward's state of a pack of pixels; g_ marks gradients of the loss.
 template <class T>
 struct alignas(64) PixelGradients {
-  T transmittance[kLanes<T>], behind[kLanes<T>];  // behind: the part of dL/dT of what lies behind, times T
+  T transmittance[kLanes<T>], behind[kLanes<T>];  // behind: T times the part of dL/dT from hits behind
   T end[kLanes<T>];
   T g_color[3][kLanes<T>], g_alpha[kLanes<T>];
   T g_normal[3][kLanes<T>], g_depth[kLanes<T>], g_median_depth[kLanes<T>],
-      median_pair[kLanes<T>];                                     // g_depth: of sum w d
+      median_pair[kLanes<T>];                                     // g_depth: gradient of sum w d
   T first[kLanes<T>], g_alpha_m[kLanes<T>], g_moment[kLanes<T>];  // distortion: its gradient times A and sum w m
   T g_boundary[kLanes<T>];
   Labels<T> labels;
@@ -48,7 +48,7 @@ BEAGS_INLINE void prefetch_gradients(const Job<T>& job, int tile) {
   if (kWanted & kBoundary) prefetch_image<1>(job, tile, g.boundary);
 }
 
-// Reads the gradients by the images. Returns the label of the whole tile, see load_labels.
+// Reads the gradients of the images. Returns the label of the whole tile, see load_labels.
 template <Parts kWanted, class T>
 BEAGS_INLINE int32_t read_gradients(const Job<T>& job, int tile, PixelGradients<T>* pixels) {
   const Images<const T>& g = job.gradients;
@@ -76,7 +76,7 @@ BEAGS_INLINE int32_t read_gradients(const Job<T>& job, int tile, PixelGradients<
   return Labels<T>::kMixed;
 }
 
-// Reads the gradients by the images and turns them into gradients by the sums that the images were made of: A is 1 - T
+// Reads the gradients of the images and turns them into gradients of the sums that make the images: A is 1 - T
 // at the end, which every Gaussian changes. Returns the label of the whole tile.
 template <Parts kWanted, class T>
 BEAGS_INLINE int32_t load_gradients(const Job<T>& job, int tile, PixelGradients<T>* pixels) {
@@ -116,7 +116,7 @@ BEAGS_INLINE int32_t load_gradients(const Job<T>& job, int tile, PixelGradients<
   return everywhere;
 }
 
-// Returns dL/dw of a hit, without the part of what lies behind it; sets `g_hit`, the gradient by its depth.
+// Returns dL/dw of a hit, without the part from hits behind it; sets `g_hit`, the gradient of its depth.
 template <Parts kWanted, class T>
 BEAGS_INLINE Real<T> weight_gradient(const Job<T>& job, int k, const Splat<T>& s, const Hits<T>& hits, int i,
                                      int32_t everywhere, const PixelGradients<T>& p, Real<T> w, Vector<T>* sums,
@@ -190,7 +190,7 @@ BEAGS_INLINE void add_gradients(const Job<T>& job, int k, const Splat<T>& s, con
 // Tracks, back to front, which groups of pixels have a pixel that is before its end.
 template <class T>
 struct Waking {
-  int end[kGroupPixels] = {};  // of the pixel of a group that stopped last
+  int end[kGroupPixels] = {};  // the latest end among a group's pixels
   int next = 0;                // the largest one among the groups that sleep
   unsigned active = 0;
 
@@ -269,8 +269,8 @@ void backward(const Job<T>& job, int tile) {
   walk_back<record_size(kWanted), (kWanted & kFeatures) != 0, kNeeds>(job, tile, pixels, add);
 }
 
-// Computes the gradients by the colours and the background alone, or by the features alone: dC/dc is w, and nothing
-// behind a hit matters.
+// Computes the gradients of the colours and the background alone, or of the features alone: dC/dc is w, and hits behind
+// do not matter.
 template <bool kOfFeatures, class T>
 void backward_colors(const Job<T>& job, int tile) {
   PixelGradients<T> pixels[kTilePacks<T>] = {};

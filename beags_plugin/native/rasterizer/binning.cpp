@@ -20,7 +20,7 @@ struct BitsOf<double> {
   using type = uint64_t;
 };
 
-// Sorts stably by depth (radix sort). Depths are positive, so their bits rise as they do.
+// Sorts stably by depth (radix sort). Depths are positive, so their bits have the same order.
 template <class T>
 void sort_by_depth(const T* depths, std::vector<int32_t>& indices) {
   using Bits = typename BitsOf<T>::type;
@@ -57,7 +57,7 @@ void sort_by_depth(const T* depths, std::vector<int32_t>& indices) {
   for (size_t i = 0; i < n; ++i) indices[i] = items[i].index;
 }
 
-constexpr int kWordGroups = 64;  // groups of a row that one word holds, a bit each
+constexpr int kWordGroups = 64;  // groups of a row in one word, a bit each
 
 // Returns the bits from .. to, 0 <= from <= to < 64.
 uint64_t bits(int from, int to) { return (~uint64_t{0} >> (63 - to)) & (~uint64_t{0} << from); }
@@ -78,7 +78,7 @@ bool find_tiles(const View& view, const Splat<T>& splat, std::vector<Reach>& out
       last = std::max(last, bands.last[row]);
     }
     for (int origin = first / kGroup * kGroup; origin <= last; origin += kWordGroups) {
-      uint64_t rows[kGroup];  // of each row of groups, those from `origin` on that are reached
+      uint64_t rows[kGroup];  // for each row of groups, the reached ones from `origin` on
       for (int row = 0; row < kGroup; ++row) {
         const int from = std::max(bands.first[row] - origin, 0);
         const int to = std::min(bands.last[row] - origin, kWordGroups - 1);

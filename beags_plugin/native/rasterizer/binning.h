@@ -10,10 +10,10 @@
 namespace beags {
 
 struct Bins {
-  std::vector<int32_t> order;         // the Gaussians that reach a tile, by rising depth, equal ones by index
+  std::vector<int32_t> order;         // the Gaussians that reach a tile, by depth, then by index
   std::vector<int64_t> record_start;  // [N + 1]: the records of a Gaussian, in the order of their tiles
   std::vector<int64_t> tile_start;    // [tiles + 1] into pairs
-  Scratch<Pair> pairs;                // by tile, then by depth; and kPrefetched unused ones
+  Scratch<Pair> pairs;                // ordered by tile, then by depth; kPrefetched unused ones follow
 };
 
 // A tile that a Gaussian reaches.
@@ -29,7 +29,8 @@ bool find_tiles(const View& view, const Splat<T>& splat, std::vector<Reach>& out
 constexpr int64_t kChunk = 256;  // Gaussians that a thread takes at a time
 
 // Sorts the Gaussians into tiles. reached: for each kChunk Gaussians, the tiles of one after the other. record_start:
-// [N + 1], where those of each start, counted through all chunks. depths: [N], of the Gaussians that reach a tile.
+// [N + 1], the start of each Gaussian's tiles, counted over all chunks. depths: [N], set for Gaussians that reach a
+// tile.
 template <class T>
 Bins bin(const View& view, const std::vector<std::vector<Reach>>& reached, std::vector<int64_t> record_start,
          const T* depths);

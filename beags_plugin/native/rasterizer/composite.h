@@ -65,8 +65,8 @@ BEAGS_INLINE void write_image(const Job<T>& job, int tile, T* image, Lanes lanes
   });
 }
 
-// Fetches the tile's part of an image, [height, width, kChannels]; null: none. Reads then wait for the memory of all
-// rows at once, not of one after the other.
+// Prefetches the tile's part of an image, [height, width, kChannels]; null: no image. Reads then wait once for all
+// rows, not for each row.
 template <int kChannels, class T>
 BEAGS_INLINE void prefetch_image(const Job<T>& job, int tile, const T* image) {
   if (!image) return;
@@ -114,7 +114,7 @@ struct Centres {
   BEAGS_INLINE Real<T> pack_y(int pack) const { return load(y + pack * kLanes<T>); }
 };
 
-// The fields of a hit, beside alpha, that later steps need.
+// The fields of a hit that later steps need besides alpha.
 constexpr unsigned kNeedDepth = 1, kNeedNearness = 2, kNeedShape = 4;
 
 // One Gaussian at the packs of a tile where it contributes. Other lanes hold 0.
@@ -161,7 +161,7 @@ BEAGS_INLINE void prefetch(const Job<T>& job, const Pair& pair) {
   if (job.num_features) __builtin_prefetch(job.features + static_cast<int64_t>(pair.splat) * job.num_features);
 }
 
-// The state of a tile on its way front to back.
+// The state of a tile that is composited front to back.
 template <class T>
 struct Walk {
   Centres<T> centre;
@@ -169,7 +169,7 @@ struct Walk {
   T end[kTilePixels];  // pairs before the one at which the pixel stopped
   Mask<T> live[kTilePacks<T>];
   unsigned active = 0;    // groups with a live pixel
-  int64_t evaluated = 0;  // packs so far
+  int64_t evaluated = 0;  // packs evaluated so far
 
   Walk(const Job<T>& job, int tile) : centre(job, tile) {
     const int pairs = static_cast<int>(job.tile_start[tile + 1] - job.tile_start[tile]);
@@ -185,7 +185,7 @@ struct Walk {
     for (int pack = 0; pack < kTilePacks<T>; ++pack) live[pack] = all(T(0.5)) < load(inside + pack * kLanes<T>);
   }
 
-  // Keeps for the backward where each pixel stopped.
+  // Saves where each pixel stopped, for the backward.
   void save(const Saved<T>& to, int tile) const {
     for (int pack = 0; pack < kTilePacks<T>; ++pack) {
       const int64_t at = saved_at<T>(tile, pack);
@@ -206,8 +206,8 @@ struct Walk {
   }
 };
 
-// Evaluates a Gaussian at the groups of pixels in `groups`; wanted(pack) are the lanes that count. To do this before
-// the hits are used keeps the chains of dependent operations short.
+// Evaluates a Gaussian at the groups of pixels in `groups`; wanted(pack) are the lanes that count. Doing this
+// before the hits are used keeps the chains of dependent operations short.
 template <unsigned kNeeds, class T, class Wanted>
 BEAGS_INLINE void collect(const Job<T>& job, const Splat<T>& splat, unsigned groups, const Centres<T>& centre,
                           Hits<T>& hits, Wanted wanted) {

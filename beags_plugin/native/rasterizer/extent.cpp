@@ -17,7 +17,7 @@ inline Four root(Four a) { return _mm_sqrt_ps(max(a, Four{})); }
 #else
 inline Four min(Four a, Four b) { return a < b ? a : b; }
 inline Four max(Four a, Four b) { return a > b ? a : b; }
-inline Four root(Four a) {  // 0 for negative numbers
+inline Four root(Four a) {  // The root of a negative number is 0.
   for (int i = 0; i < kGroup; ++i) a[i] = std::sqrt(a[i] > 0 ? a[i] : 0);
   return a;
 }
@@ -38,7 +38,7 @@ Bands Extent::bands(int tile_row) const {
   const Four y0 = Four{0, 1, 2, 3} * float(kGroup) + (static_cast<float>(tile_row * kTile) + 0.5f - cy_);
   const Four y1 = y0 + float(kGroup - 1);
   const Four low = y0 - (y_ + margin_), high = y1 - (y_ - margin_);  // the rows' centres, from the ellipse's
-  // The ellipse reaches furthest to either side at its extreme point, or as near to it as the rows come.
+  // The ellipse reaches furthest to either side at its extreme point, or at the row nearest to it.
   const auto nearest = [&](float y) {
     return min(max(min(max(zero + y, low), high), zero - half_height_), zero + half_height_);
   };

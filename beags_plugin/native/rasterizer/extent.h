@@ -30,7 +30,7 @@ struct DualConic {
     yw = r2 * (mv[0] * tilt[0] + mv[1] * tilt[1]);
     ww = r2 * (tilt[0] * tilt[0] + tilt[1] * tilt[1]) - 1;
   }
-  // For ww < 0 it is an ellipse: half the box's sides, and the covariance of which they are the diagonal.
+  // For ww < 0 it is an ellipse: half the box's sides, which are the roots of the covariance's diagonal.
   BEAGS_HD double half_width() const { return std::sqrt(std::max(0.0, xw * xw - xx * ww)) / -ww; }
   BEAGS_HD double half_height() const { return std::sqrt(std::max(0.0, yw * yw - yy * ww)) / -ww; }
   BEAGS_HD double covariance() const { return (xw * yw - xy * ww) / (ww * ww); }
@@ -47,9 +47,9 @@ class Extent {
   // Return the first and last row of pixels inside the image; first > last: none.
   BEAGS_HD int first_row() const { return first_row_; }
   BEAGS_HD int last_row() const { return last_row_; }
-  // Returns a superset of what is reached in one row of tiles, as tight as one interval per row of groups can be.
+  // Returns a superset of the groups reached in one row of tiles, as tight as one interval per row of groups can be.
   Bands bands(int tile_row) const;
-  // Sets the same for one row of groups, counted from the image's top; first > last: none.
+  // Sets this superset for one row of groups, counted from the image's top; first > last: none.
   BEAGS_HD void band(int group_row, int& first_group, int& last_group) const;
 
  private:
@@ -57,7 +57,7 @@ class Extent {
   bool on_screen_ = true;
   bool everywhere_ = true;     // the Gaussian's disc crosses the camera plane, or nearly so
   float cx_, cy_, disc_;       // pixels; the disc's radius
-  float margin_;               // pixels; what rounding may hide
+  float margin_;               // a margin for rounding, pixels
   float x_, y_, half_height_;  // the conic, an ellipse: its centre, from (cx, cy), and half its box's height
   float width_at_centre_, slope_, y_right_;  // half its width on its centre's row; how far the chord's middle moves per
                                              // row; where it touches its box on the right, from its centre
@@ -112,7 +112,7 @@ BEAGS_HD inline void Extent::band(int group_row, int& first_group, int& last_gro
   const float low = y0 - (y_ + margin_), high = y1 - (y_ - margin_);  // the rows' centres, from the ellipse's
   float left = limit, right = -limit;
   if (low <= half_height_ && high >= -half_height_) {
-    // The ellipse reaches furthest to either side at its extreme point, or as near to it as the rows come.
+    // The ellipse reaches furthest to either side at its extreme point, or at the row nearest to it.
     const auto side = [&](float y, float sign) {
       const float at = std::min(std::max(std::min(std::max(y, low), high), -half_height_), half_height_);
       const float t = at / half_height_, square = 1 + 4e-7f - t * t;  // rounded up: the root is steep at 0

@@ -57,7 +57,7 @@ void feature_channels(const Job<T>& job, int tile) {
   for_each_feature(job, tile, [&](T sum, int64_t at) { job.channels[at] = sum; });
 }
 
-// Fills the working memory with the gradients by the pixels' channels.
+// Fills the working memory with the gradients of the pixels' channels.
 template <class T>
 BEAGS_INLINE void read_feature_gradients(const Job<T>& job, int tile) {
   clear_feature_work(job);
@@ -70,7 +70,7 @@ template <class T>
 BEAGS_INLINE Real<T> add_features(const Job<T>& job, const Splat<T>& s, int pack, Real<T> w) {
   const T *f = features_of(job, s), *gradients = work_of(job, pack);
   Vector<T>* sums = pair_sums(job);
-  Real<T> g_w[2] = {all(T(0)), all(T(0))};  // two chains of dependent sums are shorter than one
+  Real<T> g_w[2] = {all(T(0)), all(T(0))};  // Two chains of dependent sums are shorter than one.
   for (int first = 0; first < job.num_features; first += 4) {
     BEAGS_UNROLL for (int c = 0; c < 4; ++c) {
       const Real<T> g = load(gradients + (first + c) * kLanes<T>);

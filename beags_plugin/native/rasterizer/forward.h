@@ -41,7 +41,7 @@ BEAGS_INLINE void add_hit(int k, const Splat<T>& s, const Hits<T>& hits, int i, 
     const Real<T> nearness = keep(all(T(0)) < w, hits.get(hits.nearness, i));
     const Real<T> seen = load(p.first), first = select(seen == all(T(0)), nearness, seen);
     store(p.first, first);
-    const Real<T> m = first - nearness;  // m_i - m_first: the differences are all that counts
+    const Real<T> m = first - nearness;  // m_i - m_first: only differences count
     const Real<T> wm = w * m;
     store(p.moment1, load(p.moment1) + wm);
     store(p.moment2, fma(wm, m, load(p.moment2)));
@@ -89,7 +89,7 @@ BEAGS_INLINE void finish(const Job<T>& job, Real<T> end, Pixels<T>& p) {
   for (int c = 0; c < 3; ++c) store(p.color[c], load(p.color[c]) + end * all(job.background[c]));
   if (kWanted & kGeometry) store(p.depth, keep(all(T(0)) < alpha, load(p.depth) / alpha));
   if (kWanted & kDistortion) {
-    // The sum over pairs, closed: A sum(w m^2) - (sum w m)^2; rounding must not make it negative.
+    // The sum over pairs in closed form, A sum(w m^2) - (sum w m)^2; rounding must not make it negative.
     const Real<T> moment1 = load(p.moment1), value = alpha * load(p.moment2) - moment1 * moment1;
     store(p.distortion, keep(all(T(0)) < value, value));
   }

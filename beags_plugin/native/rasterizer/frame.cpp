@@ -58,7 +58,7 @@ void Frame<T>::make_saved(bool keep, bool geometry, bool distortion) {
   if (!keep) return;
   const size_t pixels = static_cast<size_t>(tiles()) * kTilePixels;
   size_t used = 0;
-  kept_ = Scratch<T>(pixels * Saved<T>::kCount);  // the kernels fill all of it that they read
+  kept_ = Scratch<T>(pixels * Saved<T>::kCount);  // The kernels write all that they read.
   const auto take = [&](bool wanted) { return wanted ? kept_.get() + pixels * used++ : nullptr; };
   saved_.end_transmittance = take(true);
   saved_.end = take(true);
@@ -110,7 +110,7 @@ void Frame<T>::backward(const Inputs<T>& inputs, const int32_t* target, const Im
   for (int c = 0; c < 3; ++c) to.background[c] = static_cast<T>(background[c]);
 }
 
-// Adds up each Gaussian's records and carries them on to its parameters.
+// Adds up each Gaussian's records and propagates them to its parameters.
 template <class T>
 void Frame<T>::reduce(const Inputs<T>& inputs, const T* records, int size, const InputGradients<T>& to,
                       int threads) const {

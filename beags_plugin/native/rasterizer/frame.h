@@ -15,7 +15,7 @@ namespace beags {
 constexpr int64_t kTeamSurfels = 2000;  // projecting one takes a tenth of a microsecond
 constexpr int64_t kTeamPairs = 500;     // rendering one takes most of a microsecond
 
-// Null: not wanted. The others are zero on entry: Gaussians that were not rendered are left alone.
+// Null: not wanted. The others are zero on entry, because Gaussians that were not rendered are not written.
 template <class T>
 struct InputGradients {
   T *means, *quats, *log_scales, *opacity_logits, *colors, *screen_shift, *background;
@@ -24,8 +24,8 @@ struct InputGradients {
 // The amount of work; see Work.
 struct WorkCounts {
   int64_t lanes, contributing;
-  int64_t tile_pairs;  // (tile, Gaussian) pairs that are kept
-  int64_t box_pairs;   // those that the usual bounds, boxes of 3.33 standard deviations, would give
+  int64_t tile_pairs;  // (tile, Gaussian) pairs of these kernels' bounds
+  int64_t box_pairs;   // pairs of the usual bounds, boxes of 3.33 standard deviations
 };
 
 // The sums or pixel counts by Gaussian and class that are not zero: key = Gaussian * num_classes + class, ascending.
@@ -60,11 +60,11 @@ class Frame {
   // Sums w by Gaussian and label. labels: [height, width]; out: [N, num_classes], zero on entry. Labels outside 0 ..
   // num_classes - 1 do not count.
   void class_contributions(const int32_t* labels, int num_classes, T* out, int threads) const;
-  // Returns the same as a list, whose size does not depend on the number of classes.
+  // Returns the same sums as a list, whose size does not depend on the number of classes.
   Contributions<T> sparse_class_contributions(const int32_t* labels, int num_classes, int threads) const;
-  // Counts pixels of w > min_weight in place of summing w; exact up to 2^24.
+  // Counts pixels with w > min_weight instead of summing w; exact up to 2^24.
   Contributions<T> sparse_class_pixel_counts(const int32_t* labels, int num_classes, T min_weight, int threads) const;
-  // Sums of each pixel only the `most` largest w, of equal ones the nearer, of the first `within` that it has.
+  // Sums only the `most` largest w of each pixel (the nearer of equals) among its first `within` hits.
   Contributions<T> sparse_top_contributions(const int32_t* labels, int num_classes, int most, int within,
                                             int threads) const;
   // Finds each pixel's class. classes, share: [height, width]. Class ids lie in 0 .. num_classes - 1.
@@ -78,7 +78,7 @@ class Frame {
   // count]. keep: for its backward.
   void feature_channels(const T* features, int count, T* channels, bool keep, int threads);
   // Computes their gradients, once after `feature_channels`, with the same inputs and features. g_features: [N, count]
-  // or null; where `to` wants nothing of the geometry, they cost less.
+  // or null; without gradients of the geometry in `to`, they cost less.
   void feature_channels_backward(const Inputs<T>& inputs, const T* features, int count, const T* gradient,
                                  const InputGradients<T>& to, T* g_features, int threads) const;
   void dominant_gaussian(int32_t* indices, int threads) const;
@@ -92,7 +92,7 @@ class Frame {
     std::vector<int64_t> row_of;   // [records], where the sums of a record start, in the order of its tile's labels
     std::vector<int32_t> tile_of;  // [records]
   };
-  // query: what the kernel needs beside labels and sums.
+  // query: the kernel's inputs besides labels and sums.
   LabelSums label_sums(const int32_t* labels, int num_classes, void (*kernel)(const Job<T>&, const Query<T>&, int),
                        Query<T> query, int threads) const;
   Contributions<T> sparse(const LabelSums& found, int num_classes, int threads) const;
@@ -120,7 +120,7 @@ class Frame {
   Scratch<Splat<T>> splats_;
   Bins bins_;
   T background_[3] = {};
-  Scratch<T> kept_;  // what `saved_` points to
+  Scratch<T> kept_;  // memory of `saved_`
   Saved<T> saved_ = {};
 };
 

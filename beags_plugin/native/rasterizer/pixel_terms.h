@@ -13,7 +13,7 @@
 namespace beags {
 namespace BEAGS_ISA {
 
-// on: the lanes where it contributes; elsewhere the numbers mean nothing.
+// on: the lanes where it contributes; in other lanes the numbers have no meaning.
 template <class R, class M>
 struct SurfelHit {
   M on;
@@ -35,7 +35,7 @@ BEAGS_HD_INLINE SurfelHit<R, M> surfel_hit(const Splat<T>& s, T near_plane, R dx
   R rho = fma(u, u, v * v), depth = all(s.det) * inverse, nearness = all(s.nearness_det) * q2;
   if (!plain) {
     const R half = fma(dy, dy, dx * dx), rho2d = half + half;
-    const M plane = rho <= rho2d;  // false for NaN: an edge-on Gaussian at its centre
+    const M plane = rho <= rho2d;  // This is false for NaN, at the centre of an edge-on Gaussian.
     rho = min(rho, rho2d);
     inverse = keep(plane, inverse);
     depth = select(plane, depth, all(s.z));
@@ -49,9 +49,9 @@ BEAGS_HD_INLINE SurfelHit<R, M> surfel_hit(const Splat<T>& s, T near_plane, R dx
   return {on, alpha, depth, nearness, inverse, rho};
 }
 
-// Adds the distortion's slopes to dL/dw and to the gradient by the hit's depth. The distortion is the sum over pairs
-// w_i w_j (m_i - m_j)^2: by w_i it is m (m A - 2 sum w m) + sum w m^2, of which g_alpha has the last term, and by m_i 2
-// w_i (m A - sum w m); dm/dd = k / d^2. m is measured from the first hit's.
+// Adds the distortion's slopes to dL/dw and to the gradient of the hit's depth. The distortion is the sum over pairs of
+// w_i w_j (m_i - m_j)^2. Its derivative with respect to w_i is m (m A - 2 sum w m) + sum w m^2, whose last term g_alpha
+// has, and with respect to m_i it is 2 w_i (m A - sum w m); dm/dd = k / d^2. m is relative to that of the first hit.
 template <class T, class R>
 BEAGS_HD_INLINE void add_distortion(T mapping, R first, R nearness, R g_alpha_m, R g_moment, R w, R& g_w, R& g_hit) {
   const R m = first - nearness, slope = m * g_alpha_m - g_moment;
@@ -59,17 +59,18 @@ BEAGS_HD_INLINE void add_distortion(T mapping, R first, R nearness, R g_alpha_m,
   g_hit = fma(w * slope, all(T(2) / mapping) * (nearness * nearness), g_hit);
 }
 
-// Returns the slope by log alpha: alpha dL/dalpha = w g_w - (what lies behind) alpha / (1 - alpha), at the clamp of E3
-// too. inverse_left: 1 / (1 - alpha).
+// Returns dL/d log alpha = alpha dL/dalpha = w g_w - (the part behind) alpha / (1 - alpha), at the clamp of E3 too.
+// inverse_left: 1 / (1 - alpha).
 template <class R>
 BEAGS_HD_INLINE R log_alpha_slope(R w, R g_w, R behind, R alpha, R inverse_left) {
   return w * g_w - behind * (alpha * inverse_left);
 }
 
-// The slopes of the plane's hit by q: d rho / dq = 2 (u, v, -rho) / q2 and dL/d rho = -g_log / 2; depth = det / q2.
+// The derivatives of the plane's hit with respect to q: d rho / dq = 2 (u, v, -rho) / q2 and dL/d rho = -g_log / 2;
+// depth = det / q2.
 template <class R>
 struct PlaneSlopes {
-  R s_0, h;  // by the first two of q over (u, v), by the third
+  R s_0, h;  // derivative with respect to (q0, q1) over (u, v), and to q2
 };
 template <bool kDepths, class R>
 BEAGS_HD_INLINE PlaneSlopes<R> plane_slopes(R g_log, R g_hit, R inverse, R rho, R depth) {

@@ -1,5 +1,5 @@
-// Projects one Gaussian into one view, and its gradient back, on the CPU and on GPUs. All is float64: that costs little
-// beside the tiles, and leaves float32 images with the tiles' rounding only.
+// Projects one Gaussian into one view, and its gradient back, on the CPU and on GPUs. All is float64, which costs
+// little compared with the tiles, and gives float32 images only the tiles' rounding.
 #pragma once
 
 #include <algorithm>
@@ -47,12 +47,12 @@ BEAGS_HD inline void multiply_transposed(const double* m, const double* v, doubl
 
 template <class... Numbers>
 BEAGS_HD bool finite(Numbers... numbers) {
-  return ((0 * numbers) + ...) == 0;  // one comparison for all
+  return ((0 * numbers) + ...) == 0;  // A single comparison tests all.
 }
 
-// The Gaussian in camera space (E1), divided by its centre's depth: a, b, p over p_z.
+// The Gaussian in camera space (E1): a, b and p divided by p_z, its centre's depth.
 struct Placement {
-  double inverse_length, unit[4];          // of the quaternion
+  double inverse_length, unit[4];          // the quaternion q: 1 / |q|, q / |q|
   double axis_u[3], axis_v[3], axis_n[3];  // columns of R
   double z, inverse_z, a[3], b[3], p[3];
   double cx, cy;             // projected centre
@@ -98,13 +98,13 @@ BEAGS_HD inline void place(const View& view, const SurfelParameters& s, Placemen
 }
 
 // Returns whether rho3d <= rho2d wherever it is rendered, it lies wholly beyond the near plane and its alpha stays
-// below the maximum. Most Gaussians are so; the kernels then skip these distinctions.
+// below the maximum. For such Gaussians, which are most, the kernels skip these tests.
 BEAGS_HD inline bool is_plain(const View& view, const Splat<double>& s) {
   constexpr double kMargin = 1e-4;  // float32's rounding
   constexpr double kLog2MaxAlpha = -0.0144995696951151;
-  const double squared_disc = kLn2 * (s.log2_opacity - kLog2MinAlpha);  // of the low-pass's radius
-  // The least |q2| at most that far off the centre, and a bound of |(q0, q1)| there: rho3d <= rho2d all over the disc.
-  // Beyond it, the low-pass is too faint to be rendered.
+  const double squared_disc = kLn2 * (s.log2_opacity - kLog2MinAlpha);  // squared radius of the low-pass disc
+  // The least |q2| within this radius of the centre, and a bound of |(q0, q1)| there: rho3d <= rho2d on all of the
+  // disc. Beyond it, the low-pass is too faint to be rendered.
   const double least = std::abs(s.w_0) - std::sqrt(squared_disc * (s.w_x * s.w_x + s.w_y * s.w_y));
   const double squares = s.u_x * s.u_x + s.u_y * s.u_y + s.v_x * s.v_x + s.v_y * s.v_y;
   const double area = s.u_x * s.v_y - s.u_y * s.v_x;
@@ -121,7 +121,7 @@ BEAGS_HD inline Fate project(const View& view, const SurfelParameters& s, Splat<
   Placement at;
   place(view, s, at);
   if (!usable_quaternion(at.inverse_length)) return Fate::kNonFinite;
-  if (!finite(at.unit[0], s.scale[0], s.scale[1], at.z)) return Fate::kNonFinite;  // an overflow
+  if (!finite(at.unit[0], s.scale[0], s.scale[1], at.z)) return Fate::kNonFinite;  // It overflowed.
   if (at.z > kLargest || s.scale[0] > kLargest || s.scale[1] > kLargest) return Fate::kNonFinite;
   if (at.z <= view.near_plane || s.log2_opacity < kLog2MinAlpha) return Fate::kCulled;
   splat.log2_opacity = s.log2_opacity;
@@ -149,7 +149,7 @@ BEAGS_HD inline Fate project(const View& view, const SurfelParameters& s, Splat<
   return Fate::kRendered;
 }
 
-// Returns the gradient by mean, quat, log_scale and screen shift, from that by the splat's fields (`record`: kRecord
+// Returns the gradient of mean, quat, log_scale and screen shift, from that of the splat's fields (`record`: kRecord
 // sums).
 BEAGS_HD inline ShapeGradients project_backward(const View& view, const SurfelParameters& s, const double* record) {
   Placement at;
@@ -159,7 +159,7 @@ BEAGS_HD inline ShapeGradients project_backward(const View& view, const SurfelPa
   const double w_y = at.a[2] * mu[1] - at.b[2] * mu[0];
   const double w_0 = mu[0] * mv[1] - mu[1] * mv[0];
 
-  // The gradients by q0, q1 and q2 (sums over pixels, times 1, dx, dy): -s (q0, q1) and h, with q0 = mv1 dx - mu1 dy
+  // The gradients of q0, q1 and q2 (sums over pixels, times 1, dx, dy): -s (q0, q1) and h, with q0 = mv1 dx - mu1 dy
   // and q1 = -mv0 dx + mu0 dy.
   const double* g = record;
   const double q0[3] = {mu[1] * g[kSy] - mv[1] * g[kSx], mu[1] * g[kSxy] - mv[1] * g[kSxx],
@@ -178,7 +178,7 @@ BEAGS_HD inline ShapeGradients project_backward(const View& view, const SurfelPa
   const double g_disc_y = g_cy - at.a[2] * g_mv[0] - at.b[2] * g_mv[1];
   const double g_cx_all = g_disc_x + g[kCx], g_cy_all = g_disc_y + g[kCy];
 
-  double g_a[3], g_b[3], g_p[3];  // towards a, b, p over p_z; then towards a, b, p
+  double g_a[3], g_b[3], g_p[3];  // gradients of a, b, p over p_z; then of a, b, p
   for (int i = 0; i < 3; ++i) {
     g_a[i] = view.kx[i] * g_mu[0] + view.ky[i] * g_mv[0];
     g_b[i] = view.kx[i] * g_mu[1] + view.ky[i] * g_mv[1];
@@ -199,7 +199,7 @@ BEAGS_HD inline ShapeGradients project_backward(const View& view, const SurfelPa
   out.screen_shift[1] = g_disc_y * view.height / 2;
   multiply_transposed(view.rotation, g_p, out.mean);
   const double g_normal[3] = {at.facing * g[kNormal], at.facing * g[kNormal + 1], at.facing * g[kNormal + 2]};
-  double u[3], v[3], n[3];  // towards the columns of R
+  double u[3], v[3], n[3];  // gradients of the columns of R
   multiply_transposed(view.rotation, g_a, u);
   multiply_transposed(view.rotation, g_b, v);
   multiply_transposed(view.rotation, g_normal, n);

@@ -1,12 +1,12 @@
-// Says which quaternions are usable, by the rule of core/rotations.py.
+// Defines which quaternions are usable, by the rule of core/rotations.py.
 #pragma once
 
 #include "simd/device.h"
 
 namespace beags {
 
-// Longer ones, and those shorter than 1 / kLongestQuat, count as broken: their gradient, which is the rotation's
-// divided by the length, would overflow in float32.
+// Quaternions that are longer, or shorter than 1 / kLongestQuat, count as broken: their gradient, which is that of the
+// rotation divided by the length, would overflow in float32.
 constexpr double kLongestQuat = 1e12;
 
 template <class T>

@@ -66,8 +66,8 @@ void class_sums(const Job<T>& job, const Query<T>& query, int tile) {
   });
 }
 
-// Sums by pair and label as class_sums, but of each pixel only the `most` largest w, of equal ones the nearer, of the
-// first `within` that it has. `query.found` has room for these.
+// Sums by pair and label as class_sums, but only the `most` largest w of each pixel (the nearer of equals) among its
+// first `within` hits. `query.found` has room for these.
 template <class T>
 void top_contributions(const Job<T>& job, const Query<T>& query, int tile) {
   const int num_slots = query.num_slots[tile];
@@ -90,7 +90,7 @@ void top_contributions(const Job<T>& job, const Query<T>& query, int tile) {
     if (slot < 0) return;
     Contribution<T>* found = query.found + pixel * room;
     for (int i = 0; i < counts[pixel] && i < query.most; ++i) {
-      if (counts[pixel] > query.most) {  // brings the largest of the rest to the front
+      if (counts[pixel] > query.most) {  // This brings the largest of the rest to the front.
         int best = i;
         for (int other = i + 1; other < counts[pixel]; ++other) {
           const bool larger = found[other].w > found[best].w;
@@ -115,7 +115,7 @@ void sum_by_class(const Job<T>& job, const Query<T>& query, int tile, Walk<T>& w
   });
 }
 
-// Finds each pixel's class: the largest sum of w; of equal ones the lowest.
+// Finds each pixel's class: that of the largest sum of w, the lowest of equals.
 template <class T>
 void class_map(const Job<T>& job, const Query<T>& query, int tile) {
   const int classes = query.num_slots[0];
@@ -158,7 +158,7 @@ void class_channels(const Job<T>& job, const Query<T>& query, int tile) {
   for_each_channel(job, query, tile, [&](T sum, int64_t at) { query.channels[at] = sum; });
 }
 
-// Computes their gradients: dL/dw is dL by the channel of the Gaussian's class, whatever the number of classes.
+// Computes their gradients: dL/dw is the gradient of the channel of the Gaussian's class, for any number of classes.
 template <class T>
 void class_channels_backward(const Job<T>& job, const Query<T>& query, int tile) {
   for_each_channel(job, query, tile, [&](T& gradient, int64_t at) { gradient = query.channel_gradients[at]; });
@@ -168,7 +168,7 @@ void class_channels_backward(const Job<T>& job, const Query<T>& query, int tile)
   backward<kClassChannels>(by_class, tile);
 }
 
-// Finds each pixel's Gaussian with the largest w; of equal ones the nearer.
+// Finds each pixel's Gaussian with the largest w, the nearer of equals.
 template <class T>
 void dominant_gaussian(const Job<T>& job, const Query<T>& query, int tile) {
   T best[kTilePixels] = {}, pair[kTilePixels];

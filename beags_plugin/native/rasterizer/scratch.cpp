@@ -10,7 +10,7 @@ namespace beags {
 namespace {
 
 constexpr size_t kMostKept = 128 << 20;
-constexpr size_t kLeast = 4096;  // of a block: small ones fit each other, so that few are kept and looked through
+constexpr size_t kLeast = 4096;  // least bytes of a block: small requests share blocks, so that few are searched
 constexpr std::align_val_t kAlignment{64};
 
 struct Block {
@@ -32,7 +32,7 @@ struct Kept {
 };
 
 Kept& kept() {
-  static Kept* const all = new Kept;  // never destroyed: frames may outlive everything else
+  static Kept* const all = new Kept;  // It is never destroyed, because frames may outlive all other objects.
   return *all;
 }
 
@@ -54,7 +54,7 @@ void* take_scratch(size_t& bytes) {
       return block.memory;
     }
   }
-  bytes += bytes / 8 + 64;  // so that the next render, a little larger, still fits
+  bytes += bytes / 8 + 64;  // A slightly larger next render then still fits.
   return ::operator new(bytes, kAlignment);
 }
 

@@ -1,4 +1,4 @@
-// Hands the memory of one render to the next: fresh pages from the system cost a tenth of a render, and more on several
+// Reuses the memory of one render for the next: new pages from the system cost a tenth of a render, and more on several
 // threads.
 #pragma once
 

@@ -44,7 +44,7 @@ BEAGS_HD bool narrow(const Splat<double>& from, Splat<T>& to) {
   T zero = 0;
   const auto round = [&](double number) {
     const T rounded = static_cast<T>(number);
-    zero += 0 * rounded;  // NaN if one is not finite
+    zero += 0 * rounded;  // It becomes NaN if a number is not finite.
     return rounded;
   };
   to.cx = round(from.cx);
@@ -62,7 +62,7 @@ BEAGS_HD bool narrow(const Splat<double>& from, Splat<T>& to) {
   to.log2_opacity = round(from.log2_opacity);
   to.tilt_u = round(from.tilt_u);
   to.tilt_v = round(from.tilt_v);
-  // Edge-on, det = 0: no hit reads this number, but it must not be NaN.
+  // For an edge-on Gaussian, det = 0: no hit reads this number, but it must not be NaN.
   constexpr double kLargest = std::numeric_limits<T>::max();
   to.nearness_det = static_cast<T>(std::clamp(from.nearness_det, -kLargest, kLargest));
   for (int i = 0; i < 3; ++i) to.normal[i] = static_cast<T>(from.normal[i]);

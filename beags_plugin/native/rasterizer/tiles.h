@@ -10,8 +10,8 @@
 namespace beags {
 namespace BEAGS_ISA {
 
-// Returns the variant that renders `parts`: in float64 and without SIMD, which are for checks and comparisons, always
-// the whole.
+// Returns the variant that renders `parts`; float64 and kernels without SIMD, which serve checks and comparisons, have
+// only the complete variant.
 template <class T>
 constexpr Parts variant([[maybe_unused]] Parts parts) {
 #if defined(BEAGS_SCALAR)

@@ -11,13 +11,13 @@ constexpr int kTilePixels = kTile * kTile;
 constexpr int kGroupPixels = kGroup * kGroup;
 constexpr int tiles_along(int pixels) { return (pixels + kTile - 1) / kTile; }
 constexpr double kLog2MinAlpha = -7.994353436858858;  // log2(1 / 255); this and the next two: rasterizers/interface.py
-constexpr double kLargest = 1e18;  // world units: larger Gaussians, and those further off in depth, count as broken
+constexpr double kLargest = 1e18;  // world units; larger Gaussians, and those of larger depth, count as broken
 constexpr double kMaxAlpha = 0.99;
 constexpr double kMinTransmittance = 1e-4;
 constexpr double kLn2 = 0.6931471805599453;
 constexpr int kIgnore = 65535;
 constexpr int64_t kMostTilePairs = 1 << 24;  // the kernels count a tile's pairs in T, exact up to here in float32
-constexpr int kPrefetched = 4;               // pairs ahead whose splats are fetched; as many unused pairs end the list
+constexpr int kPrefetched = 4;  // pairs ahead whose splats are prefetched; as many unused pairs end the list
 
 // One Gaussian as one view sees it (E1, E2). M is divided by the centre's depth and recentred on the projected centre
 // c, so that with (dx, dy) = pixel - c the cross product is affine, q = dx A + dy B + C, and free of the scene's unit:
@@ -42,12 +42,12 @@ static_assert(sizeof(Splat<float>) == 96, "one and a half cache lines");
 // A Gaussian that reaches a tile.
 struct Pair {
   int32_t splat;
-  int32_t record;  // where its gradient record of this tile goes
+  int32_t record;  // index of its gradient record for this tile
   uint16_t mask;   // bit 4 row + column: the groups of the tile that it may reach
 };
 
-// The sums over pixels that the backward keeps for each pair. With s = -2 dL/d rho3d / q2^2, which leads towards q0
-// and q1, and h = dL/dq2, these moments are all that the gradient of u, v and w needs.
+// The sums over pixels that the backward stores for each pair. With s = -2 dL/d rho3d / q2^2, a factor of the gradients
+// of q0 and q1, and h = dL/dq2, these moments determine the gradient of u, v and w.
 enum Record {
   kColor,
   kLogOpacity = kColor + 3,
@@ -68,19 +68,19 @@ enum Record {
   kRecordEnd = kNormal + 3
 };
 constexpr int kColorRecord = 4;   // numbers in a record where only colours are wanted; a multiple of 4
-constexpr int kShapeRecord = 16;  // where no geometry was rendered
+constexpr int kShapeRecord = 16;  // numbers in a record without geometry
 constexpr int kRecord = 20;
 static_assert(kShapeEnd <= kShapeRecord && kRecordEnd <= kRecord, "records hold their sums");
 
-// The parts that a variant of the kernels computes beside colour and alpha.
+// The parts that a variant of the kernels computes besides colour and alpha.
 using Parts = unsigned;
 constexpr Parts kGeometry = 1, kDistortion = 2, kBoundary = 4;
 constexpr Parts kAllParts = kGeometry | kDistortion | kBoundary;
-constexpr Parts kClassChannels = 8;  // of the backward: gradients by the sums of w by class, and by nothing else
-constexpr Parts kFeatures = 16;      // the same by channels of features
+constexpr Parts kClassChannels = 8;  // backward only: gradients of the sums of w by class alone
+constexpr Parts kFeatures = 16;      // backward only: gradients of channels of features alone
 constexpr int record_size(Parts parts) { return parts & (kGeometry | kDistortion) ? kRecord : kShapeRecord; }
 
-// The images, [height, width, channels], or the gradients by them; null: not wanted.
+// The images, [height, width, channels], or their gradients; null: not wanted.
 template <class T>
 struct Images {
   T *color, *alpha, *depth, *median_depth, *normal, *distortion, *boundary;
@@ -115,7 +115,7 @@ struct Job {
   Images<const T> gradients;
   T* records;       // [pairs, record_size]
   T* g_background;  // [tiles, 3]
-  // kClassChannels: the gradients by the sums of the tile's classes, 256 pixels each, and the place of a class there.
+  // kClassChannels: the gradients of the sums of the tile's classes, 256 pixels each, and the place of a class there.
   const T* class_gradients;
   const int32_t* class_places;
   // Channels of features, whose number is a multiple of 4.
@@ -123,7 +123,7 @@ struct Job {
   const T* features;           // [N, num_features]
   T* channels;                 // [height, width, num_features]
   const T* channel_gradients;  // the same
-  T* feature_work;             // of one tile: num_features times 256 pixels, then times a register
+  T* feature_work;             // memory of one tile: num_features times 256 pixels, then times a register
   T* feature_records;          // [pairs, num_features]
 };
 
@@ -141,9 +141,9 @@ struct Query {
   const int32_t* slots;       // class_contributions: [height, width] index of the pixel's label in its tile, or -1
   const int32_t* num_slots;   // [tiles]
   const int64_t* slot_start;  // [tiles] into sums
-  T* sums;                    // of tile t: [pairs of t, num_slots[t]]
+  T* sums;                    // for each tile t: [pairs of t, num_slots[t]]
   T min_weight;               // class_pixel_counts: pixels of larger w count
-  int most, within;           // top_contributions: the most w of a pixel that count, of its first ones
+  int most, within;           // top_contributions: number of largest w that count, among the first ones of a pixel
   Contribution<T>* found;     // top_contributions: room for 256 times `within`, or times the pairs of t if fewer
   int32_t* classes;           // class_map, dominant_gaussian: [height, width]
   T* share;                   // class_map: [height, width]
@@ -166,11 +166,11 @@ struct Variant {
 };
 template <class T>
 struct Kernels {
-  Variant<T> variants[kAllParts + 1];                // by Parts
-  void (*backward_colors)(const Job<T>&, int tile);  // towards colours and background alone
+  Variant<T> variants[kAllParts + 1];                // indexed by Parts
+  void (*backward_colors)(const Job<T>&, int tile);  // gradients of colours and background alone
   void (*feature_channels)(const Job<T>&, int tile);
   void (*feature_channels_backward)(const Job<T>&, int tile);
-  void (*backward_features)(const Job<T>&, int tile);  // towards the features alone
+  void (*backward_features)(const Job<T>&, int tile);  // gradients of the features alone
   void (*class_contributions)(const Job<T>&, const Query<T>&, int tile);
   void (*class_pixel_counts)(const Job<T>&, const Query<T>&, int tile);
   void (*top_contributions)(const Job<T>&, const Query<T>&, int tile);

@@ -2,9 +2,9 @@
 #pragma once
 
 #if !defined(BEAGS_ISA) && (defined(__CUDACC__) || defined(BEAGS_CUDA_EMULATION))
-#define BEAGS_ISA device  // of what is shared
+#define BEAGS_ISA device  // namespace of shared functions
 #endif
-#define BEAGS_INLINE inline __attribute__((always_inline))  // on the CPU
+#define BEAGS_INLINE inline __attribute__((always_inline))  // the CPU's version
 #if defined(__CUDACC__)
 #define BEAGS_HD __host__ __device__
 #define BEAGS_HD_INLINE __host__ __device__ __forceinline__

@@ -71,7 +71,7 @@ InstructionSet choose() {
 }
 
 const InstructionSet& chosen() {
-  static const InstructionSet set = choose();  // tried again at the next call if it throws
+  static const InstructionSet set = choose();  // If it throws, the next call tries again.
   return set;
 }
 

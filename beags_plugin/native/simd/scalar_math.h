@@ -2,7 +2,7 @@
 // and GPUs share calls them by these names.
 #pragma once
 
-#include <math.h>  // fma, sqrt and exp2, of float too
+#include <math.h>  // fma, sqrt and exp2, also for float
 
 #include "simd/device.h"
 

@@ -103,7 +103,7 @@ BEAGS_MASK(operator<=, Real, less_equal)
 BEAGS_MASK(operator<, Real, less)
 BEAGS_MASK(operator==, Real, equal)
 BEAGS_MASK(operator&, Mask, both)
-BEAGS_MASK(without, Mask, without)  // a and not b
+BEAGS_MASK(without, Mask, without)  // lanes of a that are not in b
 #undef BEAGS_MASK
 
 template <class T>
@@ -124,13 +124,13 @@ BEAGS_INLINE Real<T> keep(Mask<T> mask, Real<T> value) {
   BEAGS_EACH(Register<T>::keep(mask.part[i], value.part[i]));
 }
 template <class T>
-BEAGS_INLINE Real<T> drop(Mask<T> mask, Real<T> value) {  // the other lanes
+BEAGS_INLINE Real<T> drop(Mask<T> mask, Real<T> value) {  // keeps the lanes outside the mask
   Real<T> out;
   BEAGS_EACH(Register<T>::drop(mask.part[i], value.part[i]));
 }
 
-// Returns 2^x for -126 < x <= 0 (lanes outside hold garbage); float32 to 2e-7: x = i + f with |f| <= 1/2, and a minimax
-// polynomial for 2^f.
+// Returns 2^x for -126 < x <= 0 (other lanes have no meaning); float32 to 2e-7: x = i + f with |f| <= 1/2, and a
+// minimax polynomial for 2^f.
 BEAGS_INLINE Real<float> exp2(Real<float> x) {
   using T = float;
   const Real<T> magic = all(12582912.0f);  // 1.5 * 2^23: the lowest bits of the sum hold x, rounded
@@ -158,7 +158,7 @@ BEAGS_INLINE void add(Vector<T>& sum, Real<T> value) {
   BEAGS_UNROLL for (int i = 0; i < kParts<T>; ++i) sum = sum + value.part[i];
 }
 template <class T>
-BEAGS_INLINE void add(Vector<T>& sum, Real<T> a, Real<T> b) {  // of a b
+BEAGS_INLINE void add(Vector<T>& sum, Real<T> a, Real<T> b) {  // adds a b
   BEAGS_UNROLL for (int i = 0; i < kParts<T>; ++i) sum = Register<T>::fma(a.part[i], b.part[i], sum);
 }
 

@@ -25,10 +25,10 @@ from browser import NEEDED, Page
 from places import ROOT
 from test_pick_browser import BLUE, RED, middle_of, summary
 from viewer_pages import HEIGHT, WIDTH, awaited, free_port, varied
+from written_splats import read_ply
 
 from beags_plugin.commands import demo, demo_picks, demo_training
 from beags_plugin.plugin.presets import preset_config
-from beags_plugin.splat_io.ply import read_ply
 
 pytestmark = [NEEDED, pytest.mark.slow("a browser clicks through a pick by WebGL in software")]
 

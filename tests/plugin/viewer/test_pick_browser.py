@@ -16,11 +16,11 @@ pytest.importorskip("nerfstudio")
 
 from browser import NEEDED, Page
 from viewer_pages import HEIGHT, WIDTH, awaited, differing, picture, varied, viewed
+from written_splats import read_ply
 
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.objects.extract import extract_objects
 from beags_plugin.plugin.presets import preset_config
-from beags_plugin.splat_io.ply import read_ply
 
 pytestmark = [NEEDED, pytest.mark.slow("a browser clicks through a pick by WebGL in software")]
 RED, BLUE = (0, 1, 2), (2, 0, 1)  # channels of the low and the high block, the strongest first

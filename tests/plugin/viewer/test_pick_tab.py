@@ -25,6 +25,7 @@ pytest.importorskip("nerfstudio")
 from clicked_pages import VIEW, click_on, page, position
 from run_folders import ring_cameras
 from viewer_windows import Window
+from written_splats import read_ply
 
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.labels.colors import colorize
@@ -41,7 +42,7 @@ from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.runs.picked import PICKED_FILE
 from beags_plugin.runs.read import read_run, read_transform
-from beags_plugin.splat_io.ply import read_ply, write_ply
+from beags_plugin.splat_io.ply import write_ply
 from beags_plugin.system.errors import UserError
 
 

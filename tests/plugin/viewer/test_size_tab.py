@@ -17,10 +17,10 @@ pytest.importorskip("nerfstudio")
 
 from clicked_pages import click_on
 from viewer_windows import Window
+from written_splats import read_ply
 
 from beags_plugin.commands.cli import main
 from beags_plugin.plugin.viewer.choice import Choice
-from beags_plugin.splat_io.ply import read_ply
 
 LOW, HIGH = (torch.tensor(POINTS[name], dtype=torch.float64) for name in ("low", "high"))
 TURN, SHIFT, SCALE = a_rotation(3), torch.tensor([0.4, -0.2, 0.1], dtype=torch.float64), 0.5

@@ -16,13 +16,13 @@ pytest.importorskip("nerfstudio")
 
 from nerfstudio.viewer.viewer_elements import ViewerClick
 from viewer_windows import ALWAYS, Window, write_finished
+from written_splats import read_ply
 
 from beags_plugin.core.membership import Membership
 from beags_plugin.labels.colors import colorize
 from beags_plugin.plugin.viewer.choice import Choice
 from beags_plugin.plugin.viewer.viewed_run import ViewedRun
 from beags_plugin.plugin.viewer.viewing import CHANNELS
-from beags_plugin.splat_io.ply import read_ply
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,7 @@ pytest.importorskip("nerfstudio")
 
 from browser import NEEDED, Page
 from viewer_pages import COLORS, HEIGHT, WIDTH, awaited, differing, painted, slid, varied, viewed
-
-from beags_plugin.splat_io.ply import read_ply
+from written_splats import read_ply
 
 pytestmark = [NEEDED, pytest.mark.slow("a browser draws a dozen views of a run by WebGL in software")]
 OUTPUTS = (

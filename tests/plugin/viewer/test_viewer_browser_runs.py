@@ -14,9 +14,10 @@ pytest.importorskip("nerfstudio")
 
 from browser import NEEDED, Page
 from viewer_pages import HEIGHT, WIDTH, awaited, differing, free_port, painted, picture, started, varied, viewed
+from written_splats import read_ply
 
 from beags_plugin.objects.extract import extract_objects
-from beags_plugin.splat_io.ply import read_ply, write_ply
+from beags_plugin.splat_io.ply import write_ply
 
 pytestmark = [NEEDED, pytest.mark.slow("a browser watches whole trainings")]
 STEPS = 60, 240  # Steps of base and refinement.

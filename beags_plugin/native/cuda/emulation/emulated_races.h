@@ -1,11 +1,11 @@
 // Reports to GCC's thread sanitizer how the emulated threads of a kernel are ordered. The sanitizer then finds what
 // compute-sanitizer's racecheck looks for, and races in global memory besides. Each thread is a fiber of the
-// sanitizer's, and only launches and barriers order fibers; operations of a warp and atomic ones do not. Without the
+// sanitizer, and only launches and barriers order fibers; operations of a warp and atomic ones do not. Without the
 // sanitizer, all of this is empty.
 //
 // All blocks share one shared memory here, so they must be ordered to not race for it, which hides races between
-// blocks. BEAGS_EMULATION_UNORDERED=1 in the environment leaves a block and the two before it unordered; ignore then
-// what is reported of shared memory.
+// blocks. BEAGS_EMULATION_UNORDERED=1 in the environment leaves a block and the two before it unordered; reports about
+// shared memory must then be ignored.
 #pragma once
 
 #if defined(__SANITIZE_THREAD__)
@@ -25,10 +25,10 @@ void __tsan_release(void* at);
 namespace beags {
 namespace emulation {
 
-constexpr unsigned kUnordered = 1;  // a switch to a fiber orders nothing
-constexpr unsigned kSets = 3;       // of fibers and stacks, which blocks use in turn: to make one takes long
+constexpr unsigned kUnordered = 1;  // flag: a switch to a fiber orders nothing
+constexpr unsigned kSets = 3;  // sets of fibers and stacks, which blocks use in turn, because making one takes long
 
-struct Places {  // whose addresses are all that matters
+struct Places {  // Only their addresses matter.
   char launched, ended[2], barrier[2];
 };
 inline Places places;
@@ -37,7 +37,7 @@ inline bool ordered() {
   return so;
 }
 
-// Of one thread of a block.
+// The places of one thread of a block.
 struct Races {
   void* fibers[kSets] = {};
   unsigned set = 0, barriers = 0;
@@ -54,7 +54,7 @@ struct Races {
   BEAGS_UNSEEN void pass() { __tsan_acquire(&places.barrier[barriers++ & 1]); }
 };
 
-// Of all blocks of a launch.
+// The places of all blocks of a launch.
 struct Grid {
   void* host = nullptr;
 
@@ -66,7 +66,7 @@ struct Grid {
     for (char& ended : places.ended) __tsan_acquire(&ended);
   }
   BEAGS_UNSEEN void leave() { __tsan_switch_to_fiber(host, kUnordered); }
-  // Of each thread of a block; two places in turn: the first threads of a block end before its last ones begin.
+  // The places of each thread of a block, two in turn, because a block's first threads end before its last ones begin.
   BEAGS_UNSEEN void begin(unsigned block) {
     __tsan_acquire(&places.launched);
     if (ordered()) __tsan_acquire(&places.ended[(block + 1) & 1]);

@@ -72,8 +72,8 @@ enum class State { kReady, kInWarp, kAtBarrier, kDone };
 
 struct Fiber {
   State state;
-  int operations;       // of its warp, so far
-  const char* barrier;  // that it waits at
+  int operations;       // operations of its warp so far
+  const char* barrier;  // the barrier that it waits at
   Races races;
 #if defined(__x86_64__)
   void* stack_pointer;
@@ -85,7 +85,7 @@ struct Fiber {
 struct Warp {
   int arrived;
   const char* operation;
-  alignas(16) unsigned char values[2][kWarp][16];  // of this operation and of the one before
+  alignas(16) unsigned char values[2][kWarp][16];  // values of this operation and of the one before
 };
 
 // The block that runs; there is one at a time.
@@ -95,7 +95,7 @@ struct Block {
   std::unique_ptr<unsigned char[]> stacks{new unsigned char[kMostThreads * kSets * kStack]};
   const std::function<void()>* body = nullptr;
   unsigned block = 0, threads = 0, current = 0;
-  int voted = 0, votes = 0;  // of the barrier: threads that said yes so far; the result
+  int voted = 0, votes = 0;  // at a barrier: threads that voted yes so far; the result
   Grid grid;
 #if defined(__x86_64__)
   void* scheduler = nullptr;
@@ -147,7 +147,7 @@ BEAGS_UNSEEN inline void start(unsigned thread) {
   unsigned char* stack = b.stacks.get() + (set * kMostThreads + thread) * kStack;
 #if defined(__x86_64__)
   void** top = reinterpret_cast<void**>(reinterpret_cast<uintptr_t>(stack + kStack) & ~uintptr_t(15));
-  *--top = nullptr;  // where a return address would lie
+  *--top = nullptr;  // in place of a return address
   *--top = reinterpret_cast<void*>(&run_fiber);
   for (int i = 0; i < 6; ++i) *--top = nullptr;
   fiber.stack_pointer = top;
@@ -180,7 +180,7 @@ BEAGS_UNSEEN inline void run_block(unsigned index, unsigned threads, const std::
   for (unsigned thread = 0; thread < threads; ++thread) start(thread);
   for (unsigned warp = 0; warp * kWarp < threads; ++warp) b.warps[warp].arrived = 0;
   for (bool alive = true; alive;) {
-    for (unsigned first = 0; first < threads; first += kWarp) {  // a warp goes as far as it can
+    for (unsigned first = 0; first < threads; first += kWarp) {  // A warp runs as far as it can.
       for (bool moved = true; moved;) {
         moved = false;
         for (unsigned thread = first; thread < first + kWarp && thread < threads; ++thread) {
@@ -310,7 +310,7 @@ V atomicExch(V* at, V value) {
 template <class V>
 V atomicMax(V* at, V value) {
   V before = __atomic_load_n(at, __ATOMIC_RELAXED);
-  // Writes an equal value too, as a GPU may, so that the thread sanitizer sees a write.
+  // Writes the value even if it is equal, as a GPU may, so that the thread sanitizer sees a write.
   while (!__atomic_compare_exchange_n(at, &before, before < value ? value : before, false, __ATOMIC_RELAXED,
                                       __ATOMIC_RELAXED)) {
   }

@@ -17,7 +17,7 @@ __global__ void __launch_bounds__(kNormalThreads) normal_kernel(NormalJob<T> job
   double error[1] = {};
   if (at < pixels) {
     const int x = static_cast<int>(at % job.width), y = static_cast<int>(at / job.width);
-    NormalTerms<T> terms = {};  // at the image's border there is no error
+    NormalTerms<T> terms = {};  // The image's border has no error.
     if (x > 0 && x + 1 < job.width && y > 0 && y + 1 < job.height) {
       const T* d = job.depth + at;
       const Depths<T> depths = {d[0], d[1], d[-1], d[job.width], d[-job.width]};

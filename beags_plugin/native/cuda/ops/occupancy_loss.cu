@@ -43,7 +43,7 @@ BEAGS_DEVICE bool is_finite(T x) {
 // A Gaussian's disc.
 template <class T>
 struct Disc : DiscFrame<T> {
-  bool broken;  // counts as nothing: a number is not finite, a scale is 0 or the quaternion cannot be used
+  bool broken;  // It counts as 0: a number is not finite, a scale is 0 or the quaternion is unusable.
 
   BEAGS_DEVICE Disc(const OccupancyJob<T>& job, int64_t i) {
     DiscFrame<T>& f = *this;
@@ -60,7 +60,7 @@ struct Disc : DiscFrame<T> {
   }
 
   // Sets the box of voxels that the disc reaches: `size` voxels along each axis, from `low`. Returns the largest size,
-  // or more than any window holds if the disc is too far away to be looked up.
+  // or a size larger than any window if the disc is too far away to be looked up.
   BEAGS_DEVICE int box(int64_t* low, int* size) const {
     constexpr int kFarOff = 1 << 20;
     int largest = 0;
@@ -111,7 +111,7 @@ BEAGS_DEVICE double sample(const OccupancyJob<T>& job, const VoxelTable& valid, 
   for (int64_t s = 0; s < job.samples; ++s, word += kGolden) {
     const uint64_t random = mix(word);
     const T area = static_cast<T>(static_cast<uint32_t>(random >> 40)) * T(1.0 / (1 << 24));  // (r / 3)^2
-    const T radius = T(3) * sqrt(area);  // the area grows with the square of the radius
+    const T radius = T(3) * sqrt(area);  // The area grows with the square of the radius.
     T u, v;
     cos_sin(static_cast<uint32_t>(random << 32 >> 40), u, v);
     u *= radius;

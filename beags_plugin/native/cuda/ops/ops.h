@@ -3,7 +3,7 @@
 #pragma once
 
 #if !defined(BEAGS_ISA)
-#define BEAGS_ISA device  // of what is shared with the CPU
+#define BEAGS_ISA device  // namespace of functions shared with the CPU
 #endif
 #include "cuda/platform.h"
 #include "ops/kernels.h"
@@ -60,7 +60,8 @@ constexpr int kPhotometricTile = 16;
 template <class T>
 void photometric(const ops::PhotometricJob<T>& job, double offset, T* value, Stream stream);
 
-// `sums` has a number for each kNormalThreads pixels; `shares` is needed only with gradients. value: [1], times scale.
+// `sums` has a number for each kNormalThreads pixels; `shares` is needed only with gradients. value: [1], the sum times
+// scale.
 constexpr int kNormalThreads = 256;
 template <class T>
 void normal_consistency(const ops::NormalJob<T>& job, T* value, Stream stream);

@@ -10,7 +10,7 @@ namespace {
 using namespace ops;
 using namespace ops::BEAGS_ISA;
 
-constexpr int kSide = kPhotometricTile, kHalo = kSide + 2 * kSsimReach;  // pixels; with those that the window reaches
+constexpr int kSide = kPhotometricTile, kHalo = kSide + 2 * kSsimReach;  // pixels; kHalo is what the window reaches
 constexpr int kSideThreads = kSide * kSide;
 
 // The tile of a block: its first pixel, and this thread's pixel.
@@ -42,7 +42,7 @@ BEAGS_DEVICE void blur_across(const T (&window)[kSsimWindow], const T (&maps)[kM
 
 template <class T>
 __global__ void __launch_bounds__(kSideThreads) photometric_kernel(PhotometricJob<T> job) {
-  __shared__ T pictures[2][kHalo][kHalo * kChannels];  // zeros outside the image
+  __shared__ T pictures[2][kHalo][kHalo * kChannels];  // with zeros outside the image
   __shared__ T down[4][kSide][kHalo];
   const PhotometricTile tile(job.width, job.height);
   const int64_t line = static_cast<int64_t>(job.width) * kChannels, map = job.height * line;
@@ -130,7 +130,8 @@ __global__ void __launch_bounds__(kSideThreads) photometric_gradient_kernel(Phot
       const T similar = blurred[0] + T(2) * x * blurred[1] + y * blurred[2];
       job.gradient[at] = job.l1_scale * sign + job.ssim_scale * similar;
     }
-    // No barrier here: the next channel's slopes may be loaded meanwhile, and `down` is written after the next barrier.
+    // No barrier is needed: the next channel's slopes may be loaded meanwhile, and `down` is written after the next
+    // barrier.
   }
 }
 

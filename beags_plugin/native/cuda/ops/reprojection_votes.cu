@@ -19,7 +19,7 @@ __global__ void cast_kernel(CastJob<T> job, VotingView<T> view) {
   const Projected<T> to = project_pixel<T, T>(job, x, y, d);
   if (!lands_in_target<T, T>(job, to, d)) return;
   int32_t column = static_cast<int32_t>(to.hx / to.z), line = static_cast<int32_t>(to.hy / to.z);
-  column -= column == job.target_width;  // the quotient may round up to the border itself
+  column -= column == job.target_width;  // The quotient may round up to the border itself.
   line -= line == job.target_height;
   const int64_t pixel = static_cast<int64_t>(line) * job.target_width + column;
   if (seen_in_target(job, pixel, to.z)) atomicAdd(job.votes + pixel * job.num_classes + label, 1u);

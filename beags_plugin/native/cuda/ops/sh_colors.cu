@@ -25,7 +25,7 @@ __global__ void colors_kernel(ColorJob<T> job, int64_t count) {
     for (int k = 1; k < kBases; ++k) value += b[k] * rest[3 * (k - 1) + c];
     value += T(0.5);
     clamped |= static_cast<uint8_t>((value < 0) << c);
-    job.colors[3 * i + c] = value < 0 ? T(0) : value;  // NaN stays
+    job.colors[3 * i + c] = value < 0 ? T(0) : value;  // NaN remains NaN.
   }
   job.clamped[i] = clamped;
 }
@@ -42,7 +42,7 @@ BEAGS_DEVICE void add(DirectionGradient<T>& sum, const DirectionGradient<T>& mor
 template <int kDegree, class T>
 __global__ void colors_backward_kernel(ColorJob<T> job, int64_t count) {
   constexpr int kBases = (kDegree + 1) * (kDegree + 1), kUsed = 3 * (kBases - 1);
-  constexpr int kStride = kUsed | 1;  // odd: a column lies in all banks
+  constexpr int kStride = kUsed | 1;  // With an odd stride a column covers all banks.
   __shared__ T rows[kThreads * kStride];
   static_assert(sizeof(rows) <= 48 << 10, "no more can be had without asking");
   const int row = 3 * job.num_rest, threads = static_cast<int>(blockDim.x), me = static_cast<int>(threadIdx.x);
@@ -66,7 +66,7 @@ __global__ void colors_backward_kernel(ColorJob<T> job, int64_t count) {
     }
     if (moves) {
       T g_basis[16] = {};
-      for (int k = 1; k < kBases; ++k) {  // the first function is constant
+      for (int k = 1; k < kBases; ++k) {  // The first function is constant.
         const T* sh = mine + 3 * (k - 1);
         g_basis[k] = g[0] * sh[0] + g[1] * sh[1] + g[2] * sh[2];
       }

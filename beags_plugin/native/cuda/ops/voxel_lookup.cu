@@ -8,7 +8,7 @@ namespace {
 using namespace ops;
 using namespace ops::BEAGS_ISA;
 
-// As VisibilityGrid's _scaled: each step is monotonic.
+// Each step is monotonic, as in VisibilityGrid's _scaled.
 template <class T>
 BEAGS_DEVICE void to_voxels(const Voxels& voxels, const T* point, T* voxel) {
   for (int axis = 0; axis < 3; ++axis) {

@@ -14,7 +14,7 @@ BEAGS_DEVICE uint64_t voxel_key(int64_t x, int64_t y, int64_t z) {
 BEAGS_DEVICE int64_t claim(uint64_t* keys, int64_t slots, uint64_t key, bool* fresh) {
   *fresh = false;
   for (int64_t at = static_cast<int64_t>(hash_of(key) & (slots - 1));; at = (at + 1) & (slots - 1)) {
-    uint64_t found = load_now(keys + at);  // once it is set, it stays
+    uint64_t found = load_now(keys + at);  // A key that is set does not change.
     if (found == kEmptyKey) {
       found = atomicCAS(reinterpret_cast<unsigned long long*>(keys + at), static_cast<unsigned long long>(kEmptyKey),
                         static_cast<unsigned long long>(key));
@@ -78,7 +78,7 @@ __global__ void vote_points_kernel(VoxelTally tally, const T* points, const int3
   int64_t v[3];
   for (int axis = 0; axis < 3; ++axis) {
     const T scaled = floor((points[3 * i + axis] - frame.origin[axis]) / frame.size);
-    if (!(fabs(scaled) < static_cast<T>(kHalf))) {  // also for NaN
+    if (!(fabs(scaled) < static_cast<T>(kHalf))) {  // This covers NaN too.
       atomicMax(tally.used + 2, 1);
       return;
     }
@@ -112,13 +112,13 @@ __global__ void decide_tally_kernel(VoxelTally tally) {
   tally.totals[i] = total;
 }
 
-// Voxels with votes and their weights, about one point or about several.
+// Voxels with votes and their weights, around one point or several.
 struct Poll {
   int64_t slots[24];
   uint32_t weights[24];
   int count;
 
-  // Adds the eight voxels about a point. Returns the class that leads in all of them that have votes; kMixed if they
+  // Adds the eight voxels around a point. Returns the class that leads in all of them that have votes; kMixed if they
   // disagree or have none. *own: the slot of the voxel that holds the point, or -1.
   template <class T>
   BEAGS_DEVICE int32_t add(const VoxelTally& tally, const T* point, int64_t* own) {
@@ -203,7 +203,7 @@ __global__ void read_kernel(VoxelTally tally, LiftedView<T> view, int32_t* label
   poll.count = 0;
   int64_t own;
   const int32_t leader = poll.add(tally, point, &own);
-  if (leader != kMixed && own >= 0) {  // more than half of each voxel's votes are more than half of any weighted sum
+  if (leader != kMixed && own >= 0) {  // More than half of each voxel's votes is more than half of any weighted sum.
     labels[i] = leader;
     confidence[i] = share_in(tally, own, leader);
     return;

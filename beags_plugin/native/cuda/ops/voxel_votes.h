@@ -14,18 +14,18 @@ struct VoxelTally {
   int64_t slots, more_slots;
   uint64_t* keys;        // [slots] 21 bits for each axis, or kEmptyKey
   int32_t* labels;       // [slots] the voxel's first class; kNoLabel: none yet
-  uint32_t* votes;       // [slots] of that class
-  int32_t* further;      // [slots] place of the voxel's next class in what follows; kNoLabel: none
+  uint32_t* votes;       // [slots] votes of that class
+  int32_t* further;      // [slots] place of the voxel's next class in the further table; kNoLabel: none
   uint64_t* more_keys;   // [more_slots] the voxel's slot << 32 | class, or kEmptyKey
   uint32_t* more_votes;  // [more_slots]
-  int32_t* more_next;    // [more_slots] as `further`
+  int32_t* more_next;    // [more_slots] next place, as in `further`
   int32_t* used;         // [3] voxels; further classes; 1 if a point was too far away for a voxel
   // After `decide`, [slots]: the class with more than half of the votes, or kMixed; all votes.
   int32_t* leaders;
   uint32_t* totals;
 };
 
-constexpr uint64_t kEmptyKey = ~uint64_t(0);  // as fill_bytes makes it with 0xFF, and so kNoLabel
+constexpr uint64_t kEmptyKey = ~uint64_t(0);  // fill_bytes makes it with 0xFF, and also kNoLabel.
 constexpr int32_t kNoLabel = -1, kMixed = -1;
 
 // Adds one vote for each pixel with a depth, for its label, 0 or more, unless that is `ignore`.

@@ -22,7 +22,8 @@ BEAGS_DEVICE T warp_sum_16(T* numbers, int lane) {
   return numbers[0] + __shfl_xor_sync(kWholeWarp, numbers[0], 1);
 }
 
-// Sums 4 numbers: lanes 8 c .. 8 c + 7 get the sum of number c. Written out: a loop would put the numbers into memory.
+// Sums 4 numbers: lanes 8 c .. 8 c + 7 get the sum of number c. Unrolled by hand, because a loop would put the numbers
+// into memory.
 template <class T>
 BEAGS_DEVICE T warp_sum_4(T n0, T n1, T n2, T n3, int lane) {
   const bool second = lane & 16, odd = lane & 8;
@@ -42,9 +43,9 @@ BEAGS_DEVICE bool fits(const Bins<T>& bins) {
 // The backward's state of a pixel; g_ marks gradients of the loss.
 template <class T>
 struct PixelGradients {
-  T transmittance, behind;  // behind: the part of dL/dT of what lies behind, times T
+  T transmittance, behind;  // behind: T times the part of dL/dT from hits behind
   int end, median_pair;
-  T g_color[3], g_alpha, g_normal[3], g_depth, g_median_depth;  // g_depth: of sum w d
+  T g_color[3], g_alpha, g_normal[3], g_depth, g_median_depth;  // g_depth: gradient of sum w d
   T first, g_alpha_m, g_moment;                                 // distortion: its gradient times A and sum w m
   T g_boundary;
   int32_t label;
@@ -100,7 +101,7 @@ BEAGS_DEVICE void pixel_gradients(T mapping, int k, const Splat<T>& s, const Hit
   constexpr bool kDepths = kWanted & (kGeometry | kDistortion);
   const T inverse_left = T(1) / (T(1) - hit.alpha);
   const T before = p.transmittance * inverse_left, w = hit.alpha * before;
-  // dL/dw, but for what lies behind, and the gradient towards the hit's depth
+  // dL/dw without the part from hits behind, and the gradient of the hit's depth
   T g_w = p.g_alpha, g_hit = 0;
   for (int c = 0; c < 3; ++c) {
     g_w = fused(p.g_color[c], s.color[c], g_w);
@@ -165,7 +166,7 @@ __global__ void __launch_bounds__(kTilePixels) backward_kernel(TileJob<T> job) {
   const int block_end = last;
   for (int stop = count; stop > 0; stop -= kBatch) {
     const int first = stop < kBatch ? 0 : stop - kBatch, here = stop - first;
-    if (first >= block_end) {  // the forward stopped before
+    if (first >= block_end) {  // The forward stopped before.
       for (int i = thread; i < here * kSize; i += kTilePixels) {
         job.records[static_cast<int64_t>(job.bins.pairs[start + first + i / kSize]) * kSize + i % kSize] = T(0);
       }
@@ -205,7 +206,7 @@ __global__ void __launch_bounds__(kTilePixels) backward_kernel(TileJob<T> job) {
       for (int warp = 0; warp < kTileWarps; ++warp) sum += sums[j][warp][number];
       job.records[static_cast<int64_t>(job.bins.pairs[start + first + j]) * kSize + number] = sum;
     }
-    // No barrier here: the next batch may be loaded meanwhile, and its sums are written after the next barrier.
+    // No barrier is needed: the next batch may be loaded meanwhile, and its sums are written after the next barrier.
   }
 }
 

@@ -27,7 +27,7 @@ __global__ void __launch_bounds__(kTilePixels) forward_kernel(TileJob<T> job) {
     }
     if (kSpread) {
       if (first == T(0)) first = hit.nearness;
-      const T m = first - hit.nearness, wm = w * m;  // m_i - m_first: the differences are all that counts
+      const T m = first - hit.nearness, wm = w * m;  // m_i - m_first: only differences count
       moment1 += wm;
       moment2 = fused(wm, m, moment2);
     }
@@ -61,7 +61,7 @@ __global__ void __launch_bounds__(kTilePixels) forward_kernel(TileJob<T> job) {
     for (int c = 0; c < 3; ++c) job.images.normal[3 * at + c] = normal[c];
   }
   if (kSpread && job.images.distortion) {
-    // The sum over pairs, closed: A sum(w m^2) - (sum w m)^2; rounding must not make it negative.
+    // The sum over pairs in closed form, A sum(w m^2) - (sum w m)^2; rounding must not make it negative.
     const T value = alpha * moment2 - moment1 * moment1;
     job.images.distortion[at] = value > T(0) ? value : T(0);
   }

@@ -16,13 +16,13 @@ constexpr int kMostTiles = 0xFFFF;  // a pair's key holds the tile above the mas
 template <class T>
 struct Bins {
   Splat<T>* splats;      // [N]
-  int32_t* counts;       // [N] how many tiles a Gaussian reaches
-  int32_t* order;        // [N] Gaussians by rising depth, equal ones by index; those that reach no tile come last
+  int32_t* counts;       // [N] number of tiles that a Gaussian reaches
+  int32_t* order;        // [N] Gaussians by depth, then by index; those that reach no tile come last
   int64_t* pair_start;   // [N + 1] the pairs of order[r] are pair_start[r] .. pair_start[r + 1] - 1
   int64_t* totals;       // [2] pairs; Gaussians with numbers that are not finite
-  int64_t capacity;      // of pairs that there is memory for; if there are more, the images are wrong
+  int64_t capacity;      // number of pairs that the memory holds; with more pairs, the images are wrong
   int32_t* pair_surfel;  // [capacity]
-  uint32_t* keys;        // [capacity] tile << kMaskBits | mask, by tile, then by depth
+  uint32_t* keys;        // [capacity] tile << kMaskBits | mask, ordered by tile, then by depth
   int32_t* pairs;        // [capacity] in the order of `keys`
   int32_t* tile_start;   // [tiles + 1] into keys and pairs
 };
@@ -32,7 +32,7 @@ struct Scratch {
   void* temporary;  // see primitives.h
   size_t temporary_bytes;
   uint32_t* keys[3];  // project: [N] each, the last one for float64 only; bin: [capacity], the first one only
-  int32_t* values;    // as one of `keys`
+  int32_t* values;    // the size of one of `keys`
 };
 
 // Projects the Gaussians; fills the part of `bins` that does not depend on the capacity. visible: [N], whether a

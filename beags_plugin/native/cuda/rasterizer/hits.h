@@ -20,7 +20,7 @@ using Hit = SurfelHit<T, bool>;
 // Returns zeros where the Gaussian does not contribute.
 template <class T>
 BEAGS_DEVICE Hit<T> evaluate(T near_plane, const Splat<T>& s, T dx, T dy, bool wanted) {
-  Hit<T> hit = surfel_hit(s, near_plane, dx, dy, wanted, s.plain);  // plain: the same for the whole warp
+  Hit<T> hit = surfel_hit(s, near_plane, dx, dy, wanted, s.plain);  // s.plain is the same for the whole warp.
   if (!hit.on) hit = Hit<T>{};
   return hit;
 }
@@ -70,7 +70,7 @@ struct Place {
   }
 };
 
-// A pixel on its way front to back.
+// The state of a pixel that is composited front to back.
 template <class T>
 struct Walk {
   T transmittance = T(1);
@@ -78,7 +78,7 @@ struct Walk {
 };
 
 // Composites a tile: calls visit(k, splat, hit, w, before) for whole warps, where a lane contributes; w is 0 in lanes
-// where nothing is added, `before` is T; k counts pairs within the tile.
+// without a contribution, `before` is T; k counts pairs within the tile.
 template <class T, class Visit>
 BEAGS_DEVICE void composite(const TileJob<T>& job, const Place<T>& place, Walk<T>& walk, Visit visit) {
   __shared__ Batch<T> batch;

@@ -6,7 +6,7 @@
 namespace beags {
 namespace cuda {
 
-// Returns enough for the functions below with that many items.
+// Returns the bytes that the functions below need for that many items.
 size_t temporary_bytes(int64_t items);
 // Sorts stably by bits first_bit .. end_bit - 1 of the keys.
 void sort_pairs(void* temporary, size_t bytes, const uint32_t* keys, uint32_t* sorted_keys, const int32_t* values,

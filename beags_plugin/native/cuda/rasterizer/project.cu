@@ -9,7 +9,7 @@ namespace beags {
 namespace cuda {
 namespace {
 
-constexpr uint32_t kLastKey = 0xFFFFFFFFu;  // of Gaussians that reach no tile, and of pairs that are not there
+constexpr uint32_t kLastKey = 0xFFFFFFFFu;  // key of Gaussians that reach no tile, and of unused pairs
 
 // Calls visit(tile, mask) for each tile that a Gaussian reaches, in rising order; see find_tiles in
 // rasterizer/binning.cpp.
@@ -36,7 +36,7 @@ BEAGS_DEVICE void for_each_tile(const Extent& extent, int tiles_x, Visit visit) 
   }
 }
 
-// Depths are positive, so their bits rise as they do.
+// Depths are positive, so their bits have the same order.
 BEAGS_DEVICE void depth_keys(float depth, uint32_t& high, uint32_t&) { memcpy(&high, &depth, sizeof high); }
 BEAGS_DEVICE void depth_keys(double depth, uint32_t& high, uint32_t& low) {
   uint64_t bits;
@@ -125,7 +125,7 @@ __global__ void tile_start_kernel(int tiles, int64_t capacity, const int64_t* to
   }
 }
 
-int bits_for(int values) {  // such that all ones is no value
+int bits_for(int values) {  // so many that all ones is not a value
   int bits = 1;
   while ((1 << bits) - 1 < values) ++bits;
   return bits;
@@ -143,7 +143,7 @@ void project_surfels(const View& view, const Inputs<T>& inputs, const Bins<T>& b
   const auto project = project_kernel<T>;
   BEAGS_LAUNCH(project, blocks_for(n, 128), 128, stream, view, inputs, bins, visible, keys, low, scratch.values);
   if (n) {
-    if (kTwoKeys) {  // by the lower half, then by the upper one
+    if (kTwoKeys) {  // Sort by the lower half, then by the upper half.
       sort_pairs(scratch.temporary, scratch.temporary_bytes, low, sorted, scratch.values, bins.order, n, 0, 32, stream);
       BEAGS_LAUNCH(gather_keys_kernel, blocks_for(n), kBlockThreads, stream, n, keys, bins.order, low);
       BEAGS_LAUNCH(copy_kernel, blocks_for(n), kBlockThreads, stream, n, bins.order, scratch.values);
@@ -169,8 +169,8 @@ void bin_surfels(const View& view, int64_t count, const Bins<T>& bins, const Scr
   const auto emit = emit_kernel<T>;
   BEAGS_LAUNCH(emit, blocks_for(count, 128), 128, stream, view, count, bins, scratch.keys[0], scratch.values);
   if (!bins.capacity) return;
-  // Pairs come by depth, and the sort is stable. Its bits reach to the top of the tile's number, where unused pairs
-  // have ones.
+  // Pairs are ordered by depth, and the sort is stable. Its bits reach to the top of the tile's number, where unused
+  // pairs have ones.
   sort_pairs(scratch.temporary, scratch.temporary_bytes, scratch.keys[0], bins.keys, scratch.values, bins.pairs,
              bins.capacity, kMaskBits, kMaskBits + bits_for(tiles), stream);
   BEAGS_LAUNCH(tile_start_kernel, blocks_for(bins.capacity), kBlockThreads, stream, tiles, bins.capacity, bins.totals,

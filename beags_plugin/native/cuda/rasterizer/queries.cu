@@ -5,8 +5,8 @@ namespace beags {
 namespace cuda {
 namespace {
 
-// Sums class contributions (E6). Weights are added as whole numbers, so that the order of atomic additions changes
-// nothing.
+// Sums class contributions (E6). Weights are added as whole numbers, so that the order of atomic additions has no
+// effect.
 template <class T>
 __global__ void __launch_bounds__(kTilePixels)
     class_contributions_kernel(TileJob<T> job, const int32_t* labels, int num_classes, unsigned long long* sums) {
@@ -20,7 +20,7 @@ __global__ void __launch_bounds__(kTilePixels)
     const unsigned long long whole =
         counts && w > T(0) ? static_cast<unsigned long long>(static_cast<double>(w) * kUnit + 0.5) : 0;
     unsigned left = __ballot_sync(kWholeWarp, whole > 0);
-    while (left) {  // one label of the warp after the other
+    while (left) {  // Each round takes one label of the warp.
       const int32_t next = __shfl_sync(kWholeWarp, label, __ffs(left) - 1);
       const unsigned long long sum = warp_sum(label == next ? whole : 0ull);
       if (place.lane == 0) {
@@ -35,8 +35,8 @@ __global__ void __launch_bounds__(kTilePixels)
 constexpr int kClassesAtOnce = 8;
 constexpr int kClassWords = (kIgnore + 31) / 32;
 
-// Finds each pixel's class: the largest sum of w; of equal ones the lowest. The tile is walked once for every eight of
-// its classes.
+// Finds each pixel's class: that of the largest sum of w, the lowest of equals. The tile is walked once for every eight
+// of its classes.
 template <class T>
 __global__ void __launch_bounds__(kTilePixels)
     class_map_kernel(TileJob<T> job, int num_classes, int32_t* classes, T* share) {
@@ -54,7 +54,7 @@ __global__ void __launch_bounds__(kTilePixels)
   __syncthreads();
   T best = 0;
   int32_t winner = 0;
-  int next = 0;  // the same in all threads
+  int next = 0;  // It is the same in all threads.
   for (;;) {
     int32_t ids[kClassesAtOnce];
     int found = 0;
@@ -88,7 +88,7 @@ __global__ void __launch_bounds__(kTilePixels)
   share[place.at] = best > T(0) ? best / (T(1) - walk.transmittance) : T(0);
 }
 
-// Finds each pixel's Gaussian with the largest w; of equal ones the nearer.
+// Finds each pixel's Gaussian with the largest w, the nearer of equals.
 template <class T>
 __global__ void __launch_bounds__(kTilePixels) dominant_gaussian_kernel(TileJob<T> job, int32_t* indices) {
   const Place<T> place(job);
