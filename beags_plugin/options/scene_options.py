@@ -68,7 +68,7 @@ class SceneOptions:
     """Factor of all learning rates of the base but that of opacities, for a base that is shorter than the official one;
     a base that polishes takes none."""
     base_lr_final: float = 1.0
-    """Factor at the base's last step of all its learning rates but that of positions: from three tenths of the base on
+    """Factor at the base's last step of all its learning rates but that of positions: from six tenths of the base on
     they fall to it. 1: they are constant, as in 2DGS. A base that polishes takes none."""
     close_contacts: bool = False
     """After the last step of a refinement by losses: close objects, such as the lid of a box, where other objects hid

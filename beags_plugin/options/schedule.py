@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 POLISH_SCHEDULE_FROM = 0.5  # a base that starts from a trained scene repeats the second half of the base schedule
-SETTLE_FROM = 0.3  # share of a base after which its other learning rates may fall
+SETTLE_FROM = 0.6  # share of a base after which its other learning rates may fall
 REFINE_SCHEDULE_FROM = 0.9  # refinement repeats the learning rates of the last tenth (27,000..30,000) of the base
 
 
