@@ -195,7 +195,7 @@ class BeagsTrainer(Trainer):
         self._estimate = Estimate(
             str(self.config.method_name),
             self.config.max_num_iterations,
-            chosen=self._start_step == 0,
+            chosen=self._start_step == 0 and self.schedule.base_steps > 0,
         )
         remove_unfinished(self.base_dir)
         (self.base_dir / REPORT_FILE).unlink(missing_ok=True)  # It marks a run as complete.
