@@ -68,9 +68,7 @@ class SilhouetteLoss(Loss):
         if not present:
             return zero
         members = ClassMembers(inputs.class_ids) if inputs.members is None else inputs.members
-        # Determinism: the objects to render follow from (seed, step) alone.
-        generator = torch.Generator().manual_seed(inputs.seed * 1_000_003 + inputs.step)
-        chosen = torch.randperm(len(present), generator=generator)[: int(self.objects)].tolist()
+        chosen = _chosen(len(present), int(self.objects), inputs.seed, inputs.step)
         terms = [self._of_object(present[rank], members.of(present[rank]), known, inputs) for rank in chosen]
         count = known.sum().double()
         share = torch.full_like(count, len(present) / len(terms)) / count
@@ -105,3 +103,9 @@ class SilhouetteLoss(Loss):
         others = torch.where(candidates, inputs.labels, IGNORE).int().reshape(-1)
         own, other = inputs.grid.count(points, ids), inputs.grid.count(points, others)
         return ((own >= self.seen) | (own >= other.clamp_min(EDGE))).view_as(candidates)
+
+
+def _chosen(count: int, wanted: int, seed: int, step: int) -> list[int]:
+    """Choose the ranks of the objects to render, from (seed, step) alone."""
+    generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
+    return torch.randperm(count, generator=generator)[:wanted].tolist()

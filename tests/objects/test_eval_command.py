@@ -150,7 +150,7 @@ def test_notes_name_missing_masks_and_views_that_were_trained_on(tmp_path):
     assert "eval_interval: 8" in text
     config.write_text(text.replace("eval_interval: 8", "eval_interval: 0"))
     notes = evaluate_run(config).notes
-    assert len(notes) == 2 and "no state before refinement" in notes[0] and "9 of these 9 views" in notes[1]
+    assert len(notes) == 2 and "no saved state from before refinement" in notes[0] and "9 of these 9 views" in notes[1]
 
 
 def test_notes_name_truth_of_another_scene(tmp_path, capsys):

@@ -13,7 +13,6 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.rasterizers import native
 from beags_plugin.rasterizers.autograd import InputGradients
 from beags_plugin.rasterizers.native import NativeRasterizer
-from beags_plugin.rasterizers.reference_geometry import project
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 
 needs_native = pytest.mark.skipif(
@@ -124,8 +123,7 @@ def across_many_tiles():
 def test_work_is_counted(scene):
     counts = native.work_counts(scene.inputs, scene.camera, scene.settings)
     reference = TorchRasterizer()
-    projected = project(scene.inputs, scene.camera, scene.settings)
-    blocks = reference._blocks(projected, scene.camera, scene.settings)
+    blocks = reference._blocks(scene.inputs, scene.camera, scene.settings)
     assert counts.contributing == sum(int((block.weights > 0).sum()) for block in blocks)
     assert counts.lanes >= counts.contributing
     assert 0 < counts.tile_pairs < counts.box_pairs
