@@ -119,6 +119,7 @@ def test_extraction_writes_a_run_and_a_ply_per_object(trained, extracted):
         assert {"scale_0", "scale_1", "scale_2"} <= set(vertex.dtype.names)
 
 
+@pytest.mark.slow("starts nerfstudio's evaluation")
 def test_the_figures_are_those_of_ns_eval(trained, tmp_path):
     folder, _ = trained
     ours, theirs = tmp_path / "ours.json", tmp_path / "theirs.json"
@@ -132,6 +133,7 @@ def test_the_figures_are_those_of_ns_eval(trained, tmp_path):
     assert len(found["objects"]) >= 5 and (tmp_path / "a.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow("starts a process for each nerfstudio command")
 def test_nerfstudio_commands_work_on_an_extracted_run(extracted, tmp_path):
     config = extracted[0]
     code, text = run("ns-export", "gaussian-splat", "--load-config", config, "--output-dir", tmp_path / "export")

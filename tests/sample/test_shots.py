@@ -23,9 +23,10 @@ from beags_plugin.sample.writer import SampleConfig, write_sample
 from beags_plugin.system.errors import UserError
 
 TRAIN, TEST = [f"train{i}" for i in range(150)], [f"test{i}" for i in range(50)]
+DESK = pytest.param("desk", marks=pytest.mark.slow("draws textures at many times the pixels of the photos"))
 
 
-@pytest.fixture(scope="module", params=("tabletop", "turntable", "room", "desk"))
+@pytest.fixture(scope="module", params=("tabletop", "turntable", "room", DESK))
 def family(request):
     return request.param
 

@@ -193,6 +193,7 @@ def wandb_history(folder):
     return history
 
 
+@pytest.mark.slow("starts wandb's service")
 def test_wandb_gets_the_same(data, run, tmp_path, monkeypatch):
     """Its real client, offline: each value of tensorboard's, at its step; pictures as files."""
     wandb = pytest.importorskip("wandb")
