@@ -67,9 +67,6 @@ class SceneOptions:
     base_lr_factor: float = 1.0
     """Factor of all learning rates of the base but that of opacities, for a base that is shorter than the official one;
     a base that polishes ignores it."""
-    base_lr_final: float = 1.0
-    """Factor at the base's last step of all its learning rates but that of positions: from six tenths of the base on
-    they fall to it. 1: they are constant, as in 2DGS. A base that polishes takes none."""
     close_contacts: bool = False
     """After the last step of a refinement by losses: close objects, such as the lid of a box, where other objects hid
     them from every photo. It takes a second or more for each object."""
@@ -92,9 +89,8 @@ class SceneOptions:
             raise UserError(f"near is {self.near} and far {self.far}: near must lie above 0 and below far.")
         if not all(0 < rate < math.inf for rate in self.position_lr):
             raise UserError(f"position_lr is {self.position_lr}: give two learning rates above 0.")
-        for name in ("base_lr_factor", "base_lr_final"):
-            if not 0 < (factor := getattr(self, name)) < math.inf:
-                raise UserError(f"{name} is {factor}: give a factor above 0.")
+        if not 0 < self.base_lr_factor < math.inf:
+            raise UserError(f"base_lr_factor is {self.base_lr_factor}: give a factor above 0.")
         make_refiner(self.refiner, self.refiner_options)
 
     def schedule(self) -> PhaseSchedule:

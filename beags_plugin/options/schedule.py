@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 POLISH_SCHEDULE_FROM = 0.5  # A base that starts from a trained scene repeats the second half of the schedule.
-SETTLE_FROM = 0.6  # share of a base after which its learning rates fall
 REFINE_SCHEDULE_FROM = 0.9  # Refinement repeats the learning rates of the base's last tenth (27,000..30,000).
 
 
@@ -59,10 +58,6 @@ class PhaseSchedule:
         if self.sharpening(step):
             return POLISH_SCHEDULE_FROM + (REFINE_SCHEDULE_FROM - POLISH_SCHEDULE_FROM) * done / self.sharpened
         return REFINE_SCHEDULE_FROM + (1.0 - REFINE_SCHEDULE_FROM) * min(done, 1.0)
-
-    def settling(self, step: int) -> float:
-        """Return how far ``step`` of the base lies in the part whose learning rates fall, 0..1."""
-        return min(max((step / max(self.base_steps, 1) - SETTLE_FROM) / (1.0 - SETTLE_FROM), 0.0), 1.0)
 
 
 def log_linear(first: float, last: float, progress: float) -> float:

@@ -102,12 +102,9 @@ def set_learning_rates(model: SceneModel, adam: Adam, configs: dict[str, Any], s
     progress, refining = model.schedule.progress(step), model.schedule.refining(step)
     from_seeds = not (refining or model.schedule.warm)
     faster = model.config.base_lr_factor if from_seeds else 1.0
-    settled = log_linear(1.0, model.config.base_lr_final, model.schedule.settling(step)) if from_seeds else 1.0
     for group in adam.param_groups:
         options = configs[group["name"]]["optimizer"]
         rate, group["weight_decay"], group["eps"] = options.lr, options.weight_decay, options.eps
         if group["name"] == "means":
             rate = log_linear(*model.config.position_lr, progress) * model.extent_on_host()
-        else:
-            rate *= settled
         group["lr"] = rate if group["name"] == "opacities" else rate * faster

@@ -50,7 +50,7 @@ def test_rows_named_after_presets_refine_as_these_do(name, count):
         )
         if row.name == "beags-paper":
             preset = replace(preset, prepare=replace(preset.prepare, k_pixels=own.prepare.k_pixels))
-        base = {"base_steps", "base_lr_factor", "base_lr_final", "densify", "exposure"}
+        base = {"base_steps", "base_lr_factor", "densify", "exposure"}
         assert {key for key, value in vars(own).items() if value != getattr(preset, key)} <= base, row.name
 
 

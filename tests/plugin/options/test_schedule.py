@@ -173,16 +173,8 @@ def test_official_learning_rates(model):
     assert rates(30_000) == refined  # the base's alone, and not that of opacities
     found, official = rates(15_000), {"means": 2.5 * 1.6e-5, **constant}
     assert found == pytest.approx({name: rate * (1 if name == "opacities" else 4) for name, rate in official.items()})
-    model.config.base_lr_final = 0.01
-    assert rates(30_000) == refined
-    assert rates(18_000) == pytest.approx(
-        {name: 4 * rate for name, rate in constant.items()} | {"opacities": 0.05, "means": 4 * 2.5 * 1.6e-4 * 100**-0.6}
-    )
-    for step, share in ((24_000, 0.1), (29_999.9, 0.01)):  # half of the way, and all of it
-        fallen = {name: rate * share * (1 if name == "opacities" else 4) for name, rate in constant.items()}
-        assert rates(step) == pytest.approx({"means": 4 * 2.5 * 1.6e-4 * 100 ** (-step / 30_000), **fallen}, rel=1e-3)
     model.schedule = PhaseSchedule(30_000, 3_000, 30_000, warm=True)
-    assert rates(0)["scales"] == rates(29_999)["scales"] == pytest.approx(0.005)  # polishing learns little
+    assert rates(0)["scales"] == pytest.approx(0.005)  # polishing learns little
 
 
 def test_only_steps_of_growth_gather_gradients(model):

@@ -19,7 +19,6 @@ from beags_plugin.system.reading.ply import write_vertices
 
 SHORT = {
     "pipeline.model.base_lr_factor": 3.0,
-    "pipeline.model.base_lr_final": 0.5,
     "pipeline.model.densify.free_share": 0.7,
 }
 
