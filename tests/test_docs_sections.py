@@ -53,7 +53,7 @@ def anchors(markdown: str) -> set[str]:
     """Return the anchors of a document's headings, formed as GitHub forms them."""
     found: set[str] = set()
     for title in HEADING.findall(without_code(markdown)):
-        title = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", title)  # of a link the text alone counts
+        title = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", title)  # Only the text of a link counts.
         base = re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
         again = sum(1 for known in found if re.fullmatch(re.escape(base) + r"(-\d+)?", known))
         found.add(f"{base}-{again}" if again else base)

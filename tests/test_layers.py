@@ -48,7 +48,7 @@ TARGETS = {
     "plugin/pipeline",
     "plugin/trainer",
 }  # a config of nerfstudio's names what it sets up, above it
-NERFSTUDIO = {"commands"}  # and all rooms of plugin/
+NERFSTUDIO = {"commands"}  # All rooms of plugin/ know it too.
 
 
 def room_of(module: str) -> str:

@@ -105,7 +105,7 @@ def test_no_set_of_gaussians_has_less_energy(seed):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_another_solver_finds_the_same_cut(seed):
-    """Of the third, capacities are so coarse that cuts tie."""
+    """The capacities of the third seed are so coarse that cuts tie."""
     networkx = pytest.importorskip("networkx")
     means, dc, w = random_scene(150, seed)
     pairs, capacities = n_links(means, dc, num_edges=4)

@@ -63,7 +63,7 @@ CORNERS = [[float(x), float(y), float(z)] for x in (0, 1) for y in (0, 1) for z 
 
 
 def hull(points: list, count: int) -> list[int]:
-    """Of the first ``count`` points."""
+    """Return the indices of the points inside the hull of the first ``count``."""
     means = torch.tensor(points)
     return inside_hull(means, torch.arange(len(means)) < count).nonzero()[:, 0].tolist()
 

@@ -124,7 +124,7 @@ def test_a_cluster_has_as_many_leaves_as_masks_that_it_covers_alike():
     silhouette[5:9] = False  # a fifth of 1 is covered, which is not more than a fifth
     labels = parts.PseudoMasks(torch.zeros(3).long(), masks.classes, column(0.1, 0.1, 0.1), torch.ones(3).bool())
     assert parts.fine_clusters(column(*[0.0] * 14), silhouette, masks, labels) == 2
-    assert parts.fine_clusters(column(*[0.0] * 4, *[0.61] * 10), silhouette, masks, labels) == 1  # beyond 0.5
+    assert parts.fine_clusters(column(*[0.0] * 4, *[0.61] * 10), silhouette, masks, labels) == 1  # 0.51 off is too far.
     assert parts.fine_clusters(column(*[0.0] * 14), silhouette, masks, labels, most=1) == 1
 
 

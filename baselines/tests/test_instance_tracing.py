@@ -30,7 +30,7 @@ VIEWS = {  # pixels of the two classes in each of five views; views that see it,
 
 @pytest.mark.parametrize("columns", [2, 1_000_000])
 def test_ambiguous_in_too_many_of_the_views_that_see_it(columns):
-    """Also with ids far apart: only pairs that occur are given."""
+    """The result is the same with class ids far apart, because only pairs that occur are given."""
     traced = InstanceTracing(len(VIEWS))
     for view in range(5):
         table = torch.tensor([views[view] for views, *_ in VIEWS.values()])

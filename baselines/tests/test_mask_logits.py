@@ -87,7 +87,8 @@ def test_few_views_need_more_epochs():
     steps = MaskLogits(torch.zeros(1))
     for _ in range(24):
         steps.step(torch.tensor([-1.0]))
-    assert float(steps.logits) == pytest.approx(2.235, abs=6e-4)  # what a port that takes the last step would find
+    # A port that also takes the last step would find this.
+    assert float(steps.logits) == pytest.approx(2.235, abs=6e-4)
     assert float(steps.logits.sigmoid()) == pytest.approx(0.9033, abs=6e-5)
     assert [mask_logits.phase_epochs(views) for views in (1, 12, 23, 24, 300)] == [48, 4, 3, 2, 2]
 

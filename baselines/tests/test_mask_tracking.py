@@ -30,7 +30,7 @@ ZEROS, CONTAINED, SPLIT = spread((75, 0), (25, 1)), spread((30, 0), (60, 3), (10
 
 
 def suspect(*others: dict[int, int], least: int = 80) -> bool:
-    """Whether the mask of class 1 in view 0 is under-segmented, seen from other views, which have no such masks."""
+    """Return whether the mask of class 1 in view 0 is under-segmented, seen from views without such masks."""
     return (0, 1) in tracked_masks([view_of(each) for each in (WHOLE, *others)], 2_000, 10, least).suspect
 
 
@@ -158,7 +158,7 @@ class Wall:
         return (shares.argmax(dim=1) == 1).nonzero()[:, 0]
 
     def excess(self, members: torch.Tensor) -> tuple[float, float]:
-        """By how many pixels the radius of the members, drawn alone, is too large; and their IoU."""
+        """Return by how many pixels the radius of the members, drawn alone, is too large, and their IoU."""
         alone = replace(self.inputs, **{name: getattr(self.inputs, name)[members] for name in FLOATS})
         alpha = self.rasterizer.rasterize(alone, self.camera, self.settings, torch.zeros(3)).alpha
         drawn = alpha.view(self.inside.shape) > 0.5
@@ -167,7 +167,7 @@ class Wall:
 
 
 def test_seeds_reach_as_far_beyond_a_small_object_as_beyond_a_large_one():
-    """By nearly twice a Gaussian's size, assignment by less: what that costs falls as the object grows."""
+    """Seeds reach nearly two Gaussian sizes too far, assignment less; what that costs falls as the object grows."""
     by_seeds, by_assignment = [], []
     for wall in (Wall(20), Wall(40)):
         by_seeds.append(wall.excess(wall.seeds(MIN_WEIGHT, MIN_GAUSSIANS)))

@@ -48,7 +48,7 @@ def test_ids_with_few_samples_take_no_part():
 
 
 def test_the_gradient_of_contrast():
-    """That of the formula as it is written, with norms and f held at their values."""
+    """The gradient is that of the formula as it is written, with norms and f held at their values."""
     generator = torch.Generator().manual_seed(0)
     drawn = torch.randn(90, 3, generator=generator, dtype=torch.float64) + 0.5
     ids = torch.tensor([0] * 25 + [1] * 30 + [2] * 35)

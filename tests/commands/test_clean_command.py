@@ -62,7 +62,7 @@ def test_a_scene_is_refined_and_written_back_in_its_format(tmp_path, monkeypatch
 
 @pytest.mark.slow("refines a scene of another program")
 def test_masks_are_made_where_there_are_none_and_gaussians_with_volume_are_polished(tmp_path, monkeypatch, capsys):
-    """As from photos that have poses alone; what stands out in them is found by a source of masks, here a given one."""
+    """The photos have poses but no masks: a source of masks, here a given one, finds what stands out in them."""
     monkeypatch.chdir(tmp_path)
     scene = write_start_scene(tmp_path / "data")
     (tmp_path / "made").mkdir()

@@ -111,7 +111,7 @@ def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
 
     assert again() == ("ns-train", 1)  # This one fails.
     assert again() == ("resume", 2)  # This one is killed.
-    assert again() == ("resume", 3) and measured == [3]  # then the demo is killed
+    assert again() == ("resume", 3) and measured == [3]  # Then the demo is killed.
     assert again() == ("resume", 3) and measured == [3, 3]
     with pytest.raises(UserError, match=r"out/run holds a run that was trained with --downscale 1.0: add --fresh"):
         demo.run_demo(data, output, "beags-tiny", 2.0, 0, False)

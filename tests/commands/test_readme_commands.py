@@ -48,7 +48,7 @@ RUN = {  # In this order, each command in README.md with the flags to append.
     "beags masks make --data X --source NAME": "--options folder=masks --output made",
     "beags masks check --data X": "",
     "ns-train beags-fast --data my_scene": SHORT.replace("base-steps 60", "base-steps 200"),  # killed on its way
-    "beags resume RUN": "",  # and so goes on
+    "beags resume RUN": "",  # The killed training goes on.
     f"beags export {CONFIG} --all --format ply glb": "--resolution 24 --output exported",
     "beags masks reproject --load-config C": "",
     "beags view outputs/...": "",  # It runs until its page is there.

@@ -122,7 +122,7 @@ def test_far_surfels_are_measured_by_the_distance_of_the_nearest_camera():
     far = replace(CONFIG, far_limits=True)
     assert length_units(means, centers, EXTENT, far).tolist() == [EXTENT, 6.0, 30.0]
     assert length_units(means * math.nan, centers, EXTENT, far).shape == (3,)  # such surfels are dropped elsewhere
-    # too large beside the cameras is not too large far behind what they look at
+    # A size that is too large beside the cameras is not too large far behind what they look at.
     surfels, step = scene([HUGE, HUGE], [0.5, 0.5]), CONFIG.prune_scale_after + 1
     edited = densify(surfels, torch.tensor([LOW, LOW]), torch.tensor([EXTENT, 3 * EXTENT]), far, step, generator())
     assert edited.source.tolist() == [1]

@@ -54,9 +54,9 @@ def test_what_stands_before_a_camera_is_told_from_what_stands_beside_behind_or_b
     means = [
         [0.0, 0.0, 0.5],  # It stands before the camera.
         [0.27, 0.0, 0.5],  # It is beside the picture by less than a tenth of its width.
-        [0.4, 0.0, 0.5],  # further beside it
-        [0.0, 0.0, -0.5],  # a point behind it
-        [0.0, 0.0, 1.1],  # beyond the depth
+        [0.4, 0.0, 0.5],  # It is further beside it.
+        [0.0, 0.0, -0.5],  # It is behind the camera.
+        [0.0, 0.0, 1.1],  # It is beyond the depth.
     ]
     found = reaches_before_camera(discs(means), [camera()], torch.tensor([1.0]))
     assert found.tolist() == [True, True, False, False, False]

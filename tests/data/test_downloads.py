@@ -123,7 +123,7 @@ def test_spin_nerf_masks_every_photo_that_has_one(fern, tmp_path, capsys):
     assert "1 masks of other photos are left out (IMG_9999, ...)" in " ".join(capsys.readouterr().out.split())
 
 
-MISSING = {  # what is removed from NVOS's folder: the sentence
+MISSING = {  # paths to remove from NVOS's folder, and the sentence about each
     "masks": "has no folder masks: give --nvos the folder that holds masks and scribbles.",
     "masks/fern": "has no object of a scene 'fern': name one of horns_center, horns_left with --scene.",
     f"masks/fern/{TARGET}_mask.png": "masks/fern holds no mask <photo>_mask.png: restore the download.",

@@ -41,7 +41,7 @@ def test_llff_makes_the_largest_images_as_wide_as_papers_do(tmp_path, monkeypatc
     assert camera.width == WIDTH - 4 < largest
     assert f"are used {WIDTH - 4} pixels wide, as in the paper (" in " ".join(capsys.readouterr().out.split())
     assert camera_from_nerfstudio(parse(root, downscale_factor=1.0).cameras, 0).width == largest
-    assert "in the paper" not in capsys.readouterr().out  # that is another size
+    assert "in the paper" not in capsys.readouterr().out  # This size is not the paper's.
 
 
 @pytest.mark.parametrize(("papers", "words"), [(WIDTH, "20 pixels wide, as in the paper"),

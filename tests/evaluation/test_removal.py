@@ -52,8 +52,8 @@ def decibels(wrong_pixels: int, of: int, by: float = HIGH - LOW) -> float:
     ("squares", "ids", "taken", "psnr", "remains"),
     [
         ([PIECE, CUP], (1, 1), 1, None, 0.0),  # all of it is the cup's
-        ([PIECE, CUP], (0, 1), 1, decibels(16, 64), 16 / 64),  # a piece stays, as it is the background's
-        ([PIECE, CUP], (2, 1), 1, decibels(16, 64), 16 / 64),  # or another object's
+        ([PIECE, CUP], (0, 1), 1, decibels(16, 64), 16 / 64),  # A piece stays, as it is the background's.
+        ([PIECE, CUP], (2, 1), 1, decibels(16, 64), 16 / 64),  # A piece stays, as it is another object's.
         ([CUP], (0,), 1, decibels(64, 64), 1.0),  # nothing is taken out
         # the cup hides half of the box: those pixels count, but do not tell whether the box is there
         ([CUP, BOX], (1, 2), 2, None, 0.0),

@@ -16,7 +16,7 @@ from beags_plugin.rasterizers.interface import RasterSettings
 WIDTH, HEIGHT, FOCAL = 64, 48, 40.0
 WALL, DISC = 4.0, 2.0  # depths
 SIGMA, OPACITY = 0.3, 0.99
-RADIUS = SIGMA * math.sqrt(2 * math.log(2 * OPACITY))  # where half of the light passes
+RADIUS = SIGMA * math.sqrt(2 * math.log(2 * OPACITY))  # Half of the light passes at this distance.
 
 
 def camera(x: float, width: int = WIDTH, z: float = 0.0) -> Camera:

@@ -186,7 +186,7 @@ def test_a_browser_draws_the_object_and_asks_no_network(tmp_path, cup):
         page.follow((tmp_path / "cup.html").as_uri())
 
         def alike() -> bool:
-            """Whether page and picture overlap and have the same colours there; Gaussians fade in one by one."""
+            """Return whether page and picture overlap with the same colours there; Gaussians fade in one by one."""
             shown = np.asarray(Image.open(io.BytesIO(page.picture())).convert("RGB")).astype(float)
             on_page = shown.min(axis=2) < DRAWN
             both = silhouette & on_page

@@ -101,7 +101,7 @@ def test_the_signs_of_the_bands_are_those_of_the_turned_directions():
 
 
 def test_a_known_gaussian_has_known_bytes(tmp_path):
-    """By hand, from the description; y and z are turned."""
+    """The expected bytes are put together by hand, from the description; y and z are turned."""
     c, s = math.cos(0.3), math.sin(0.3)
     surfel = Surfels(
         torch.tensor([[1.0, -0.5, 0.25]]),

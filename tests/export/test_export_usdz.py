@@ -57,7 +57,7 @@ def test_pixars_library_reads_it(tmp_path, textured, closed):
 
 
 def issues(path) -> list[str]:
-    """What Pixar's validators find in a file."""
+    """Return what Pixar's validators find in a file."""
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert validators
     found = UsdValidation.ValidationContext(validators).Validate(Usd.Stage.Open(str(path)))

@@ -91,7 +91,7 @@ def test_a_file_says_that_its_gaussians_are_discs(tmp_path, kind):
 @READ_BY_PLAYCANVAS
 @pytest.mark.parametrize("name", ["cup.2dgs.ply", "cup.compressed.ply", "cup.sog"])
 def test_playcanvas_knows_that_they_are_discs(tmp_path, name):
-    """Since 3.4 it writes a .ply with two scales of what it knows to be discs, and says so."""
+    """From version 3.4 on, splat-transform writes discs that it knows as a .ply with two scales, and says so."""
     kind = {"cup.2dgs.ply": "ply-2dgs", "cup.sog": "sog"}.get(name, "compressed-ply")
     surfels = random_surfels(count=300)
     back = converted(written(tmp_path / name, kind, surfels), tmp_path / "back.ply")
@@ -149,7 +149,7 @@ def test_what_is_not_finite_is_left_out_and_nothing_is_a_sentence(tmp_path, kind
 
 
 def test_a_known_gaussian_has_known_words_in_a_compressed_ply(tmp_path):
-    """By hand, from the description: two Gaussians at the ends of the chunk's ranges, and one in between."""
+    """The words are by hand, from the description: two Gaussians at the ends of the chunk's ranges, one between."""
     s = math.sqrt(0.5)
     surfels = Surfels(
         torch.tensor([[0.0, 0.0, 0.0], [1.0, 2.0, 4.0], [0.5, 1.0, 1.0]]),

@@ -61,7 +61,7 @@ def standing(tilt: torch.Tensor, seed: int = 0) -> tuple[torch.Tensor, torch.Ten
         return torch.tensor(low) + share * (torch.tensor(high) - torch.tensor(low))
 
     table = some(3000, [-1, -1, 0.0], [1, 1, 0.0])
-    table = table[(table[:, 0].abs() > 0.2) | (table[:, 1].abs() > 0.15)]  # what it stands on is hidden
+    table = table[(table[:, 0].abs() > 0.2) | (table[:, 1].abs() > 0.15)]  # The object hides what it stands on.
     wall, other = some(3000, [-1, 0.4, 0.0], [1, 0.4, 1.0]), some(500, [0.25, -0.1, 0.0], [0.45, 0.1, 0.15])
     around = torch.cat([table, wall, other]) + 0.001 * torch.randn(1, 3, generator=generator, dtype=torch.float64)
     own = some(2000, [-0.2, -0.15, 0.0], [0.2, 0.15, 0.2])

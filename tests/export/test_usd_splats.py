@@ -43,7 +43,7 @@ def path_of(folder, kind: str):
 
 
 def issues(path) -> list[str]:
-    """What Pixar's validators find in a file: those of usdchecker."""
+    """Return what Pixar's validators, those of usdchecker, find in a file."""
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert len(validators) > 10
     found = UsdValidation.ValidationContext(validators).Validate(Usd.Stage.Open(str(path)))
@@ -153,7 +153,7 @@ def test_what_encloses_nothing_has_no_collider_but_its_splats(tmp_path):
 
 
 def test_half_floats_transforms_and_what_is_missing_are_read(tmp_path):
-    """By hand: what another program may write."""
+    """The file is written by hand, as another program may write it."""
     stage = Usd.Stage.CreateNew(str(tmp_path / "theirs.usda"))
     UsdGeom.SetStageUpAxis(stage, "Z")
     place = UsdGeom.Xform.Define(stage, "/Room")
@@ -162,7 +162,7 @@ def test_half_floats_transforms_and_what_is_missing_are_read(tmp_path):
     field = volumes.ParticleField3DGaussianSplat.Define(stage, "/Room/Splats")
     field.GetPrim().GetAttribute("positionsh").Set(Vt.Vec3hArray([Gf.Vec3h(1, 2, 3), Gf.Vec3h(0, 0, 0)]))
     field.GetScalesAttr().Set(Vt.Vec3fArray([(0.5, 0.25, 0.125)] * 2))
-    field.GetOpacitiesAttr().Set([0.25])  # too short: ignored
+    field.GetOpacitiesAttr().Set([0.25])  # The list is too short, so it is ignored.
     stage.GetRootLayer().Save()
     found = read_scene(tmp_path / "theirs.usda").gaussians
     assert found.means.tolist() == [[12, 4, 6], [10, 0, 0]]

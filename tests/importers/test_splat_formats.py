@@ -231,7 +231,7 @@ def sorted_by_place(scene: Gaussians | Surfels) -> Gaussians | Surfels:
 @pytest.mark.parametrize(("kind", "name", "bounds"), OURS, ids=[kind for kind, *_ in OURS])
 def test_every_splat_format_that_we_write_is_read(tmp_path, kind, name, bounds):
     surfels = random_surfels(count=300)
-    apart = torch.cartesian_prod(*3 * [torch.arange(7.0)])[:300]  # so that both readings sort alike
+    apart = torch.cartesian_prod(*3 * [torch.arange(7.0)])[:300]  # places so far apart that both readings sort alike
     surfels = Surfels(**{**vars(surfels), "means": apart})
     scene = read_scene(write(tmp_path / name, kind, surfels))
     assert len(scene.gaussians) == 300 and scene.normalization is None
@@ -241,7 +241,7 @@ def test_every_splat_format_that_we_write_is_read(tmp_path, kind, name, bounds):
     found = differences(sorted_by_place(flatten(scene.gaussians)[0]), sorted_by_place(surfels))
     limits = {"means": 1e-6, "log_scales": 1e-6, "sh_dc": 1e-6, "sh_rest": 0.3, "alphas": 0.003, **bounds}
     assert all(value <= limits[key] for key, value in found.items()), found
-    assert bool(scene.remarks) == (kind not in ("ply", "ply-2dgs"))  # what is lossy says so
+    assert bool(scene.remarks) == (kind not in ("ply", "ply-2dgs"))  # Lossy formats say so.
 
 
 # -- files of other programs -------------------------------------------------------------------------------------------

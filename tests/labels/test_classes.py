@@ -35,7 +35,7 @@ def test_sixteen_bits_keep_large_ids_and_ignore(tmp_path):
     ids = np.array([[0, 1, 300], [IGNORE, 65534, 255]], dtype=np.int32)
     write_mask(tmp_path / "a.png", ids)
     assert np.array_equal(read_id_mask(tmp_path / "a.png"), ids)
-    assert np.array_equal(read_id_mask(str(tmp_path / "a.png"), ignore_ids=[255]), ids)  # for 8-bit files only
+    assert np.array_equal(read_id_mask(str(tmp_path / "a.png"), ignore_ids=[255]), ids)  # ignore_ids: 8-bit files only
 
 
 def test_ignore_ids_of_eight_bit_files(tmp_path):
@@ -71,7 +71,7 @@ def test_binary_masks_of_all_kinds(tmp_path, array, inside):
     mask = read_binary_mask(tmp_path / "a.png")
     assert mask.dtype == bool and np.array_equal(mask, inside)
     ones = read_mask(tmp_path / "a.png", "binary")
-    ones[ones == IGNORE] = 0  # of 16 bits
+    ones[ones == IGNORE] = 0  # Masks of 16 bits alone hold it.
     assert ones.dtype == np.uint16 and np.array_equal(ones, np.asarray(inside, int))
 
 

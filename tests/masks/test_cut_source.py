@@ -130,7 +130,7 @@ def test_a_stroke_beside_the_object_keeps_off_what_it_crosses(run, tmp_path):
     row, column = pixel_of(run.cameras[3], (0.15, 0.25, 0.5))
     both = {"view": "v3", "strokes": [[run.pixel(3, "low"), run.pixel(3, "high")]]}
     _, wide = make(CutSource(), scene_with(run, tmp_path, [{"name": "one", "prompts": [both]}]))
-    one = {"view": "v3", "strokes": [[run.pixel(3, "low")]]}  # of a single place, as a click
+    one = {"view": "v3", "strokes": [[run.pixel(3, "low")]]}  # This stroke has a single place, as a click.
     one["outside_strokes"] = [[run.pixel(3, "high"), [column, row]], [run.pixel(3, "floor")]]
     _, maps = make(CutSource(), scene_with(run, tmp_path, [{"name": "one", "prompts": [one]}]))
     (prompted,) = read_prompts(tmp_path / "prompts.json")

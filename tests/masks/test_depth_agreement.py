@@ -12,7 +12,7 @@ from beags_plugin.core.lifting import lift
 from beags_plugin.masks.voxel_reprojection import disagreement
 
 WIDTH, HEIGHT, FOCAL = 24, 18, 30.0
-PLACES = (0.0, 0.153, 0.251, 0.317)  # along x
+PLACES = (0.0, 0.153, 0.251, 0.317)  # x of the cameras
 NEIGHBOURS = (1, 2, 3, 2)
 
 
@@ -31,7 +31,7 @@ def views(count: int = 4) -> tuple[list[torch.Tensor], list[Camera]]:
 
 
 def by_loops(depths, cameras, tau: float) -> list[float]:
-    """Of every pixel whose point its neighbour sees, in order."""
+    """Return the disagreement of every pixel whose point its neighbour sees, in ascending order."""
     found = []
     for depth, camera, j in zip(depths, cameras, NEIGHBOURS, strict=True):
         points = lift(depth, camera).view(-1, 3) - cameras[j].center  # the cameras are not turned
@@ -66,7 +66,7 @@ def test_noise_shows_and_the_scale_of_the_scene_does_not():
     exact, wrong = (disagreement(d, cameras, math.inf, 0.95) for d in (depths, noisy))
     assert exact is not None and wrong is not None
     assert exact < 0.2  # half a pixel's width on a plane that leans by 0.2
-    sigma = 0.05 * math.sqrt(2) * FOCAL / 4  # of a difference of two depths, in pixels
+    sigma = 0.05 * math.sqrt(2) * FOCAL / 4  # deviation of the difference of two depths, in pixels
     assert 1.6 * sigma < wrong < 2.4 * sigma  # 95 % lie within 1.96 sigma
     large = [Camera(camera.viewmat.clone(), camera.K, WIDTH, HEIGHT) for camera in cameras]
     for camera in large:

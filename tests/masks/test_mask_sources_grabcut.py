@@ -98,7 +98,8 @@ def test_outlines_snap_to_the_edge_of_the_photo():
 
 def test_plain_opencv_has_no_guided_filter(monkeypatch):
     cv2 = pytest.importorskip("cv2")
-    monkeypatch.setattr(cv2, "ximgproc", type("shell", (), {}))  # what plain opencv installed over contrib leaves
+    # Plain opencv, installed over contrib, leaves such a shell.
+    monkeypatch.setattr(cv2, "ximgproc", type("shell", (), {}))
     labels = np.zeros((8, 9), np.uint16)
     labels[2:5] = 1
     with pytest.raises(UserError, match="run beags doctor"):

@@ -51,7 +51,7 @@ def test_views_that_cut_or_add_parts_are_named_by_the_points_that_they_saw(tmp_p
     found = json.loads((tmp_path / "out/report.json").read_text())["contradictions"]
     assert {(one["view"], one["class_id"], one["of"]) for one in found} == {("v03", 1, "points"), ("v07", 2, "points")}
     with Image.open(tmp_path / "out/contradicted.png") as picture:
-        assert picture.size[0] > 1200  # both views
+        assert picture.size[0] > 1200  # It shows both views.
     good = write_balls(tmp_path / "good")
     write_model(good)
     assert issues(good) == {}
@@ -90,9 +90,9 @@ def test_a_view_that_is_bad_blames_no_other():
     labels[:, :3] = 1
     labels[:, 3] = 0
     labels[40:, 4] = 0
-    labels[50:, :2] = UNSEEN  # there the bad views have the majority
+    labels[50:, :2] = UNSEEN  # At these points the bad views have the majority.
     agreement = Agreement(labels, 2, least=2)
-    assert agreement.confusion[2, 0, 1] == 10  # at these they blame a good one
+    assert agreement.confusion[2, 0, 1] == 10  # At these points they blame a good view.
     found = settle(agreement, [f"v{view}" for view in range(6)], [0, 7])
     assert [(one.view, one.class_id) for one in found] == [("v3", 7), ("v4", 7)]
     assert (found[0].missing, found[0].extra, found[0].total) == (50, 0, 50)

@@ -183,12 +183,13 @@ def test_a_prompt_in_a_tracked_frame_stays_in_the_same_memory(weights, photos):
     before = tracked(memory, range(FRAMES))
     for one in (memory, fresh):
         one.prompt(3, [again])
-    assert held(memory, "non_cond") == [[]]  # what was tracked about a lost frame tells that the object is absent
+    # What was tracked about a lost frame would tell that the object is absent.
+    assert held(memory, "non_cond") == [[]]
     after, alone = tracked(memory, range(3, FRAMES)), tracked(fresh, range(3, FRAMES))
     assert held(memory) == [[0, 3]]
     assert np.abs(after[3] - before[3]).max() > 0
-    np.testing.assert_array_equal(after[3], alone[3])  # the prompt alone says what is in its frame,
-    assert np.abs(after[4] - alone[4]).max() > 0  # and the first one is known in the others
+    np.testing.assert_array_equal(after[3], alone[3])  # The prompt alone says what is in its frame.
+    assert np.abs(after[4] - alone[4]).max() > 0  # The first prompt is known in the other frames.
 
 
 def test_an_object_of_several_parts_is_their_union(weights, photos):
@@ -211,7 +212,7 @@ def test_a_memory_forgets_what_the_model_no_longer_looks_at(weights, photos, mon
     for _ in memory.track(range(FRAMES)):
         kept += held(memory, "non_cond")
         assert len(memory.session.processed_frames.keys()) <= 1 and held(memory) == [[0]]
-    assert kept == [[], [1], [1, 2], [1, 2, 3], [2, 3, 4]]  # as the next is tracked
+    assert kept == [[], [1], [1, 2], [1, 2, 3], [2, 3, 4]]  # frames held as each next one is tracked
     outputs = memory.session.output_dict_per_obj[0]
     assert not any("high_res_masks" in one for group in outputs.values() for one in group.values())
 

@@ -22,7 +22,7 @@ from beags_plugin.rasterizers.rendering import render_class_map
 COLOURS = {0: (0.6, 0.6, 0.6), 1: (0.8, 0.2, 0.2), 2: (0.2, 0.3, 0.8)}
 CAMERAS = views(12)
 SHIFTS = {1: (-0.45, -0.4, 0.0), 2: (0.35, -0.25, 0.0), 3: (-0.4, 0.55, 0.0)}
-"""Of the low block, the high one, and a second low one (3): nothing touches."""
+"""Shifts of the low block, the high one, and a second low one (3), so that none touches another."""
 
 
 def taken(surfels: Surfels, chosen: torch.Tensor, shift: tuple[float, float, float]) -> list[torch.Tensor]:
@@ -51,8 +51,8 @@ def matched(numbers: torch.Tensor, class_ids: torch.Tensor) -> dict[int, int]:
 def test_three_things_apart_become_three_classes_in_all_masks(scene):
     surfels, numbers, rasterizer, exact = scene
     given = [(mask > 0).int() for mask in exact]
-    given[3] = torch.zeros_like(given[3])  # the network has missed them there
-    given[4] = (exact[4] == 2).int()  # and there it took one of them
+    given[3] = torch.zeros_like(given[3])  # The network has missed the things there.
+    given[4] = (exact[4] == 2).int()  # It took one of them there.
     given[5] = None
     known, stage = ClassRanks(torch.arange(2)), lambda name: nullcontext()
     masks, report = agree(surfels, CAMERAS, LabelMaps(given), known, rasterizer, SETTINGS, stage, things=3)
@@ -96,7 +96,7 @@ def test_a_streak_links_nothing_and_parts_do_not_depend_on_scale_or_order():
     generator = np.random.default_rng(0)
     centres = np.concatenate([generator.normal(0, 0.1, (200, 3)) + [x, 0, 0] for x in (0.0, 2.0)])
     deviations = np.full(400, 0.03)
-    centres[7], deviations[7] = (1.0, 0.0, 0.0), 3.0  # between both
+    centres[7], deviations[7] = (1.0, 0.0, 0.0), 3.0  # a streak between both
     parts = parts_of(centres, deviations)
     sides = [np.bincount(parts[side]).max() for side in (slice(0, 200), slice(200, 400))]
     assert min(sides) > 170 and np.bincount(parts[:200]).argmax() != np.bincount(parts[200:]).argmax()

@@ -16,7 +16,7 @@ def scene(contrast=0.3, seed=0):
     """A disc on a ground of another colour, both with noise; returns the photo [H, W, 3] uint8 and the exact labels."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     reach = np.hypot(x - 60.0, y - 45.0)
-    coverage = np.clip(25.5 - reach, 0.0, 1.0)  # of the pixel, about
+    coverage = np.clip(25.5 - reach, 0.0, 1.0)  # about the disc's share of each pixel
     generator = np.random.default_rng(seed)
     photo = 0.3 + contrast * coverage[..., None] * [1.0, 0.5, -0.5] + generator.normal(0.0, 0.02, (HEIGHT, WIDTH, 3))
     return (255.0 * np.clip(photo, 0.0, 1.0)).astype(np.uint8), (reach < 25.0).astype(np.uint16)
@@ -61,7 +61,7 @@ def test_filtering_the_box_of_a_class_gives_what_the_whole_picture_gives(monkeyp
     photo, exact = scene()
     labels = exact.copy()
     labels[2:6, 3:20] = 2
-    labels[85:, 110:] = 3  # at a corner of the picture
+    labels[85:, 110:] = 3  # This class lies at a corner of the picture.
     small = [snap_to_edges(labels, photo, radius) for radius in (1, 2)]
     monkeypatch.setattr(snapping, "_around", lambda indicator, margin: (slice(None), slice(None)))
     whole = [snap_to_edges(labels, photo, radius) for radius in (1, 2)]

@@ -39,7 +39,7 @@ def test_any_number_of_chunks_gives_the_same_bits(monkeypatch, dtype):
 
 
 def test_chunks_hold_about_as_many_bricks_as_they_may():
-    """Against a count of all bricks."""
+    """The chunks are compared with a count of all bricks."""
     g = torch.Generator().manual_seed(0)
     cameras = larger_scene()[1][:1] * 4
     height, width = cameras[0].height, cameras[0].width

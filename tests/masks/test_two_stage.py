@@ -96,7 +96,7 @@ def test_every_lost_frame_is_asked_and_what_is_found_joins_the_memory(tmp_path):
 
 
 def test_a_text_starts_at_all_boxes_near_the_best_and_raises_the_second_threshold(tmp_path):
-    # near 0.9 are 0.9 and 0.63 (70 %), and stage 2 takes 0.765 (85 %)
+    # Scores from 0.63 (70 %) on are near 0.9, and stage 2 takes those from 0.765 (85 %) on.
     scores = {1: [0.35], 2: [0.7], 3: [0.62, 0.9, 0.64], 6: [0.76], 7: [0.77]}
     cup = PromptedObject(1, "cup", {}, text="a cup")
     _, maps, (memory, asked) = run(tmp_path, [cup], "AAAAAABC", scores)

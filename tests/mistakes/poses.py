@@ -153,7 +153,7 @@ def dtu(content: dict[str, Any]) -> Callable[[Place], Any]:
 
 
 def llff_rows() -> np.ndarray:
-    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # from OpenGL's axes to LLFF's
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # turn from OpenGL's axes to LLFF's
     poses = [np.c_[pose[:3, :3] @ turn, pose[:3, 3], [HEIGHT, WIDTH, 17.0]] for pose in ring(9)]
     return np.array([np.r_[pose.ravel(), 1.0, 5.0] for pose in poses])
 

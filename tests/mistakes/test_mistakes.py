@@ -51,7 +51,7 @@ def test_a_mistake_ends_with_one_sentence_and_code_2(name, templates, tmp_path, 
     assert "Traceback" not in printed.out + printed.err
     lines = [line for line in printed.out.splitlines() if line.startswith("beags: ")]
     assert len(lines) == 1 and printed.out.splitlines()[-1] == lines[0]
-    assert len(printed.out.splitlines()) < 40  # what else is printed does not bury it
+    assert len(printed.out.splitlines()) < 40  # Other output does not bury it.
     assert not [each.message for each in recwarn if each.filename.endswith(("engine/trainer.py", "utils/writer.py"))]
     sentence = lines[0].removeprefix("beags: ").replace(str(tmp_path), "{tmp}")
     sentence = re.sub(r"\.masks_\w+", ".masks_...", sentence)  # a temporary folder
@@ -67,7 +67,7 @@ def test_a_mistake_ends_with_one_sentence_and_code_2(name, templates, tmp_path, 
     else:
         assert sentence == SENTENCES[name]
     assert sentence.endswith(".") and len(sentence) < 500
-    assert re.search(r"(: |; |\. )[A-Za-z-]", sentence)  # what to do follows what is wrong
+    assert re.search(r"(: |; |\. )[A-Za-z-]", sentence)  # The sentence goes on with what to do.
 
 
 def test_every_sentence_is_of_a_mistake():

@@ -80,7 +80,7 @@ def test_a_manifest_goes_before_a_file_that_it_lists_is_written_again(trained, t
     main(["export", "--load-config", str(trained), "--all", "--output", str(tmp_path)])
     manifest = tmp_path / "manifest.json"
     main(["export", "--load-config", str(trained), "--object", "cup", "--format", "spz", "--output", str(tmp_path)])
-    assert manifest.exists()  # of other files
+    assert manifest.exists()  # It lists other files.
     seen = []
 
     def fail(self, path, item):

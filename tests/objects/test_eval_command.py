@@ -56,7 +56,7 @@ def test_the_figures_of_a_run_are_those_of_its_files(trained):
     assert run.before is not None and [view.name for view in run.after.views] == ["v00", "v08"]
     root = trained.parents[1] / "lab"
     evaluated = EvaluatedRun(trained)
-    shown = evaluated.shown()  # of the scene before refinement, for both
+    shown = evaluated.shown()  # The scene before refinement decides for both.
     del evaluated.stages["before"]
     assert not all(map(torch.equal, shown, evaluated.shown()))
     for scene, shift in ((run.before, 0.15), (run.after, 0.0)):
@@ -180,7 +180,7 @@ def test_truth_is_undistorted_like_the_photographs(tmp_path):
     """Discs at known rays, drawn through the lens into masks of twice the size: they must lie where the rays do."""
     rays = [(x, y) for x in (-0.4, -0.1, 0.25) for y in (-0.3, 0.2)]
     write_transforms(tmp_path / "lab", **{**LENS, **BROWN, "camera_model": "OPENCV"})
-    rows, columns = (np.mgrid[: 2 * LARGE_H, : 2 * LARGE_W] + 0.5) / 2  # in pixels of the photograph
+    rows, columns = (np.mgrid[: 2 * LARGE_H, : 2 * LARGE_W] + 0.5) / 2  # centres in pixels of the photograph
     ids = np.zeros(rows.shape, np.uint8)
     for number, ray in enumerate(rays, 1):
         u, v = distort("OPENCV", *ray)
@@ -206,7 +206,7 @@ def test_truth_is_undistorted_like_the_photographs(tmp_path):
         expected = view.camera.K.double() @ torch.tensor([x, y, 1.0], dtype=torch.float64)
         scale = torch.tensor([height / view.camera.height, width / view.camera.width], dtype=torch.float64)
         offsets.append(there.mean(0) / scale - expected[:2].flip(0))
-    # in pixels of the photograph: without undistortion the outer discs are off by several
+    # Offsets in pixels of the photograph: without undistortion the outer discs are off by several.
     assert torch.stack(offsets).abs().max() < 0.75 and torch.stack(offsets).mean(0).abs().max() < 0.25
     focal, center = np.array([LENS["fl_x"], LENS["fl_y"]]), np.array([LENS["cx"], LENS["cy"]])
     assert max(np.abs(distort("OPENCV", *ray) - (focal * ray + center)).max() for ray in rays) > 2
@@ -229,7 +229,7 @@ def test_photographs_with_alpha_stand_on_the_background_of_the_training(tmp_path
     options = open_for_training(config).data_config
     manager = options.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
     batch = manager.fixed_indices_eval_dataloader[0][1]
-    random = torch.tensor([0.2, 0.5, 0.9])  # in training the photograph stands on the colour that was drawn
+    random = torch.tensor([0.2, 0.5, 0.9])  # In training the photograph stands on the random colour.
     model = type("Model", (), {"device": "cpu", "get_gt_img": BeagsModel.get_gt_img})()
     seen = BeagsModel._truth(model, batch, random)
     wanted = share * rgba[..., :3] / 255.0 + (1 - share) * random.numpy()

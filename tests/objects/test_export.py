@@ -182,7 +182,7 @@ def test_quick_formats_come_before_slow_ones_and_all_of_an_object_before_the_nex
 
 
 def test_meshes_of_a_run_lie_where_its_discs_are(trained, tmp_path, monkeypatch):
-    """In the input's frame, from the run's own views; the manifest tells what was left out, and why."""
+    """Meshes lie in the input's frame, made from the run's own views; the manifest tells what was left out, and why."""
     trimesh = pytest.importorskip("trimesh")
     pytest.importorskip("open3d")
     arguments = ["export", "--load-config", str(trained), "--format", "glb", "--resolution", "64", "--output"]
@@ -240,7 +240,8 @@ def test_closed_objects_say_what_is_invented(trained, tmp_path, capsys):
             assert "_INVENTED" not in read.vertex_attributes
             continue
         closing = one["closing_gaussians"]
-        added = closing["gaussians"]  # of few and large Gaussians; test_closing.py has objects that get some
+        # This object has few and large Gaussians, so it may get none; test_closing.py has objects that get some.
+        added = closing["gaussians"]
         doubted = f"nothing closed, as {closing['doubt']}" if closing["doubt"] else "nothing to close"
         assert f"; {f'{added} more close what no photo shows' if added else doubted}" in said
         for table in plain:
@@ -291,7 +292,7 @@ def test_meshes_need_the_data(tmp_path, capsys):
 
 
 def test_an_exporter_of_another_package(trained, tmp_path, monkeypatch):
-    """As docs/extending.md shows it."""
+    """The exporter is the one that docs/extending.md shows."""
     monkeypatch.setitem(EXPORTERS._specs, "xyz", "test_export:PointsExporter")
     main(["export", "--load-config", str(trained), "--object", "cup", "--format", "xyz", "--output", str(tmp_path)])
     assert np.loadtxt(tmp_path / "cup.xyz").shape == (25, 3)

@@ -32,7 +32,7 @@ from beags_plugin.sample.views import View, make_views
 
 WIDTH, HEIGHT = 640, 480
 OBJECTS = {class_id: name for class_id, name in CLASSES.items() if class_id}
-LEAST_IOU, MOST_COLOR_ERROR = 0.95, 0.015  # of silhouettes; mean over pixels and channels, of 1
+LEAST_IOU, MOST_COLOR_ERROR = 0.95, 0.015  # IoU of silhouettes; mean error over pixels and channels, in 0..1
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ WRONG = {
 
 @pytest.mark.parametrize("mistake", WRONG)
 def test_a_wrong_mesh_does_not(written, splats, views, mistake):
-    """What the comparison above would catch, in every view."""
+    """The comparison above would catch each mistake, in every view."""
     mesh = WRONG[mistake](read(written / "world/cup.glb"))
     for view in views:
         if view.split == "test":

@@ -41,7 +41,7 @@ def test_names_made_of_the_same_pieces_never_meet():
 
 
 def test_each_object_has_files_of_its_own(tmp_path):
-    """Also where one's name ends as another's format begins; each file holds the Gaussians of its class alone."""
+    """One name even ends as another's format begins; each file holds the Gaussians of its class alone."""
     config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
     rename_classes(config, {0: "Cup", 1: "cup", 2: "cup.2dgs"})
     formats = ("ply", "ply-2dgs", "compressed-ply")

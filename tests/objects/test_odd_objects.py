@@ -57,7 +57,7 @@ def test_where_all_have_gaussians_or_are_not_asked_for_nothing_is_said(tmp_path,
     rename_classes(config, {0: "background", 1: "cup", 2: "box", 3: "lid"})
     main(["export", "--load-config", str(config), "--object", "cup", "--output", str(tmp_path / "one")])
     main(["extract", "--load-config", str(config), "--object", "cup", "--output", str(tmp_path / "runs")])
-    main(["export", "--load-config", str(tmp_path / "runs/cup/config.yml"), "--all"])  # which lacks all but the cup
+    main(["export", "--load-config", str(tmp_path / "runs/cup/config.yml"), "--all"])  # This run has the cup alone.
     assert "no Gaussian belongs" not in capsys.readouterr().out
     assert manifest_in(tmp_path / "runs/cup/exports")["empty"] == []
 

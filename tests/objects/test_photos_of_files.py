@@ -61,7 +61,7 @@ def test_photos_that_were_shrunk_have_sharper_ones(tmp_path):
         assert sharper.camera.focal == pytest.approx(4 * photo.camera.focal, rel=0.02)
         image = sharper.image()
         assert image.shape == (sharper.camera.height, sharper.camera.width, 3)
-        assert (image - drawn(sharper.camera)).abs().mean() < 0.004  # what the file shows there, to a rounding
+        assert (image - drawn(sharper.camera)).abs().mean() < 0.004  # The file shows this there, up to rounding.
         own, exact = sharper.own(), drawn_labels(sharper.camera) == CUP
         assert (own & exact).sum() > 0.8 * (own | exact).sum()
         assert sharper.depth().shape == own.shape

@@ -84,7 +84,7 @@ def test_a_camera_path_is_followed_as_nerfstudio_does(config, camera_path, tmp_p
     main([*words, "--object", "cup", "box", "--output", str(tmp_path / "a.mp4")])
     main([*words, "--object", "cup", "--format", "before-after", "--output", str(tmp_path / "b.mp4")])
     both, pair = frames(tmp_path / "a.mp4"), frames(tmp_path / "b.mp4")
-    assert 0 < np.count_nonzero(both[0] > 50) < np.count_nonzero(film[0] > 50)  # without the background
+    assert 0 < np.count_nonzero(both[0] > 50) < np.count_nonzero(film[0] > 50)  # The background is left out.
     assert pair[0].shape == (96 + 18 + 4, 2 * (128 + 4), 3)
 
 

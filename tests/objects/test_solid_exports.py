@@ -21,7 +21,7 @@ from beags_plugin.runs.layout import TRANSFORM_FILE
 from beags_plugin.surfaces.color import srgb_from_linear
 from beags_plugin.system.reading.ply import read_vertices
 
-PAINTED = {0: (0.6, 0.6, 0.6), 1: (0.2, 0.7, 0.3), 2: (0.7, 0.7, 0.2)}  # in the photos, not in the splats
+PAINTED = {0: (0.6, 0.6, 0.6), 1: (0.2, 0.7, 0.3), 2: (0.7, 0.7, 0.2)}  # colours of the photos, which the splats lack
 BOXES = {
     "low": np.array([[-0.4, -0.2, 0.0], [0.0, 0.2, 0.25]]),
     "high": np.array([[0.0, -0.35, 0.0], [0.3, 0.35, 0.5]]),
@@ -103,7 +103,7 @@ def test_what_stands_on_a_plane_is_turned_upright(trained, tmp_path):
     finally:
         (trained.parent / TRANSFORM_FILE).unlink()
     for name, box in BOXES.items():
-        sides = 2.0 * np.ptp(box, axis=0)  # as the run is half as large as the input
+        sides = 2.0 * np.ptp(box, axis=0)  # The run is half as large as the input.
         up = np.array(upright[name]["up"])
         assert up @ tilt.numpy().T[:, 2] > np.cos(np.radians(1.0))
         points, tilted = (points_of(tmp_path / folder / f"{name}.ply") for folder in ("upright", "tilted"))
@@ -118,12 +118,12 @@ def test_blocks_that_touch_are_closed_where_they_do(trained, tmp_path):
     found = export(trained, tmp_path, "--format", "ply", "glb", "--close")
     for name, least, towards in (("low", 0.35, 1.0), ("high", 0.7, -1.0)):
         low, high = BOXES[name]
-        read, beyond = mesh_in(tmp_path / f"{name}.glb"), 0.07  # as far as discs at its rims reach
+        read, beyond = mesh_in(tmp_path / f"{name}.glb"), 0.07  # Discs at its rims reach that far.
         solid = trimesh.Trimesh(read.vertices, read.faces)
         assert solid.is_watertight and least < solid.volume / np.prod(high - low) < 1.1
         assert (towards * read.vertices[:, 0]).max() < beyond
         invented = read.vertices[np.ravel(read.vertex_attributes["_INVENTED"]) > 0]
-        assert ((np.abs(invented[:, 1]) < 0.15) & (invented[:, 2] > 0.05)).sum() > 10  # above what the floor hid
+        assert ((np.abs(invented[:, 1]) < 0.15) & (invented[:, 2] > 0.05)).sum() > 10  # The floor hid nothing up there.
         assert found[name]["closing_gaussians"]["gaussians"] > 20
         table = read_vertices(tmp_path / f"{name}.ply")
         added = points_of(tmp_path / f"{name}.ply")[table["invented"] == 1]

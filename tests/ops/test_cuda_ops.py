@@ -118,7 +118,7 @@ def loss_and_gradients(surfels, grid, device, **options):
 @pytest.mark.parametrize("options", [{"samples": 20}, {"samples": 3, "background": False}])
 @pytest.mark.parametrize("stretch", [0.001, 1.0, 100.0])
 def test_the_occupancy_loss_is_the_torch_versions(stretch, options, device, torch_version):
-    """On dense and hashed tables, for discs of all sizes, some of them broken."""
+    """The tables are dense and hashed, the discs of all sizes, some of them broken."""
     surfels, grid = test_occupancy_loss.make_surfels(700), test_occupancy_loss.make_grid(stretch)
     with torch.no_grad():
         surfels.means[5, 1], surfels.log_scales[6, 0], surfels.opacity_logits[7] = torch.nan, -torch.inf, torch.inf

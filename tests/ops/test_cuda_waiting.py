@@ -67,7 +67,7 @@ def gpu(monkeypatch):
     on_gpu = lambda *tensors: module if tensors[0].device.type == "cuda" else None  # noqa: E731
     monkeypatch.setattr(cuda_extension, "module_for", on_gpu)
     monkeypatch.setattr(cuda_extension, "call", lambda *_: None)
-    # What the host draws at random would have no data either.
+    # Numbers that the host draws at random would have no data either.
     monkeypatch.setattr(silhouette, "_chosen", lambda count, wanted, *_: list(range(count))[:wanted])
     with FakeTensorMode(), Fetches() as fetches:
         yield fetches
@@ -106,7 +106,7 @@ def inputs(surfels: Surfels, **known) -> LossInputs:
 
 
 def members_of_two() -> ClassMembers:
-    """As a step before has left it."""
+    """Return class members as an earlier step has left them."""
     members = ClassMembers(torch.zeros(N, dtype=torch.int32, device="cuda"))
     members._order, members._spans = torch.arange(N, device="cuda"), {0: (0, 20), 1: (20, 40), 3: (40, 50)}
     return members

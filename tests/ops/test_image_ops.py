@@ -120,7 +120,7 @@ def test_every_run_gives_the_same_bits(device):
 
 
 def test_without_a_gradient_the_values_are_the_same(device):
-    """Then there are no slopes and no shares to keep."""
+    """Without a gradient there are no slopes and no shares to keep."""
     size, dtype = (20, 30), torch.float64
     photo, drawn = _pictures(size, dtype, device)
     camera, depth, normal, alpha = _view(size, dtype, device)

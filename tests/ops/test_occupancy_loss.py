@@ -22,7 +22,7 @@ CLASSES = 4
 
 
 def make_surfels(count: int, dtype=torch.float64, shift: float = 0.0) -> Surfels:
-    """Around the grid's cloud, of all sizes: discs within a voxel, over a few, and over many."""
+    """Make discs around the grid's cloud, of all sizes: within a voxel, over a few, and over many."""
     g = torch.Generator().manual_seed(5)
     values = (
         torch.rand(count, 3, generator=g, dtype=torch.float64) * 2.6 - 0.3 + shift,

@@ -66,7 +66,7 @@ def test_any_number_of_threads_gives_the_same_bits(dtype, for_threads):
 
 
 def test_awkward_numbers(without_extension):
-    """At the camera, not finite, and just at the clamp: as the torch version."""
+    """Gaussians at the camera, not finite, or just at the clamp get what the torch version gives them."""
     sh, means, center, weight = scene(6, 16)
     with torch.no_grad():
         means[0] = center

@@ -46,7 +46,7 @@ def overlap(found: torch.Tensor, exact: torch.Tensor) -> float:
 @pytest.mark.parametrize("scene", ["coloured", "grey"])
 @pytest.mark.parametrize("solid", [1, 2])
 def test_a_solid_is_cut_from_the_one_that_it_touches_and_from_the_floor(scene, solid, request):
-    """By colours and creases; by creases alone where all is grey."""
+    """Colours and creases tell solids apart; where all is grey, creases alone do."""
     cutter, owner = request.getfixturevalue(scene)
     own, other = (LOW_TOP, HIGH_TOP) if solid == 1 else (HIGH_TOP, LOW_TOP)
     found = cutter.solve([marks(views()[3], [own], [other, FLOOR])])
@@ -152,7 +152,7 @@ def test_bad_marks_end_with_a_sentence(coloured):
 
 
 def test_a_cut_that_a_limit_leaves_nothing_of_is_refused(coloured, monkeypatch):
-    """Of two Gaussians that the point on the object shows, a limit leaves out one, the point beside has the other."""
+    """The point on the object shows two Gaussians: a limit leaves out one, and the point beside has the other."""
     cutter, owner = coloured
     shares = np.zeros((2, len(cutter._graph.nodes)))
     shares[0, :2], shares[1, 1] = (0.6, 0.4), 0.9
@@ -223,7 +223,7 @@ def test_bits_are_the_same_for_one_and_for_three_threads():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
 def test_a_scene_on_cuda_is_cut_by_marks_on_the_host(coloured):
-    """As pages and files give them; the same Gaussians as on the CPU."""
+    """Pages and files give marks on the host; the cut has the same Gaussians as on the CPU."""
     surfels, _ = solids(COLOURED)
     moved = type(surfels)(**{field.name: getattr(surfels, field.name).cuda() for field in fields(surfels)})
     cutter = Cutter(moved, views(), make_rasterizer("auto"), SETTINGS)

@@ -9,7 +9,7 @@ import torch
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.picking.graph import LONGEST, SHORTEST, mean_lengths, surface_graph
 
-HALF = 4.0  # of the square's sides
+HALF = 4.0  # half of the square's side
 
 
 @pytest.fixture(scope="module")

@@ -159,7 +159,7 @@ def test_what_hides_below_the_object_or_behind_it_is_shown():
 
 
 def test_a_stray_far_from_the_object_is_in_the_picture():
-    stray = moved(ball(0.0, count=1), 0.0, 0.0, -2.6, size=0.5)  # beyond the box, which strays do not widen
+    stray = moved(ball(0.0, count=1), 0.0, 0.0, -2.6, size=0.5)  # It lies beyond the box, which strays do not widen.
     stages = {"before": ball(), "after": joined(ball(), stray)}
     (line,) = cells(object_cells(1, "ball", stages, [], photos(), BALLS), LARGEST)
     assert all(black(cell) > 0.00005 for cell in line[1::2])

@@ -67,7 +67,7 @@ def test_errors_are_painted_over_the_photograph():
     assert painted[0, 0].tolist() == [GREY] * 3
     for x, code in enumerate((RIGHT, MISSED, WRONG, LEFT_OUT), 1):
         assert painted[0, x].tolist() == [(GREY + channel) // 2 for channel in COLORS[code]]
-    assert (photo == GREY).all()  # not painted in place
+    assert (photo == GREY).all()  # It is not painted in place.
 
 
 def test_the_worst_come_first():

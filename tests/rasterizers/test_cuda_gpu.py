@@ -75,7 +75,7 @@ def test_a_graph_of_forward_and_backward_replays_cuda():
 
 
 def test_a_training_step_makes_the_host_wait_for_no_copy_cuda():
-    """In this mode torch raises where it waits itself; what ``CudaRasterizer`` waits for is an event."""
+    """In this mode torch raises where it waits itself; ``CudaRasterizer`` waits for an event instead."""
     from beags_benchmarks.kernels.scenes import Size, make_scene, on_device
     from beags_benchmarks.kernels.training_step import TrainingStep
 

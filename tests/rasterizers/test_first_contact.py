@@ -237,4 +237,4 @@ def test_the_doctor_tries_anew_and_shows_the_verdict(monkeypatch):
     Gpu(monkeypatch, "Agrees")
     found = first_contact_check()
     assert found.ok and found.sentence.startswith("NVIDIA X draws what the torch reference draws")
-    assert verdict(contact("DrawsWrongly")).reason == ""  # what the doctor found is what is kept
+    assert verdict(contact("DrawsWrongly")).reason == ""  # The doctor's finding is kept.

@@ -112,7 +112,7 @@ def test_order_of_gaussians_and_names_of_classes_do_not_matter(rasterizer, scene
 @EXAMPLES
 @given(scene=scenes(), data=st.data())
 def test_a_window_of_the_picture_is_the_picture_of_a_window(rasterizer, scene, data):
-    """However the tiles fall, a pixel shows the same."""
+    """A pixel shows the same, however the tiles fall."""
     x0, y0 = data.draw(st.integers(0, scene.camera.width - 1)), data.draw(st.integers(0, scene.camera.height - 1))
     width = data.draw(st.integers(1, scene.camera.width - x0))
     height = data.draw(st.integers(1, scene.camera.height - y0))

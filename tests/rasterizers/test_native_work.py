@@ -131,7 +131,7 @@ def test_work_is_counted(scene):
 
 @needs_native
 def test_bounds_are_tight():
-    """As many pixels are looked at as need be: scenes like captures, surfels some 17 pixels wide."""
+    """Few pixels are looked at in vain in scenes like captures, with surfels some 17 pixels wide."""
     scene = make_scene(count=1000, width=128, height=96, seed=2, opacity=-1.0, size=-1.8)
     camera = replace(scene.camera, K=torch.tensor([[100.0, 0, 60.0], [0, 100.0, 50.0], [0, 0, 1.0]]).double())
     counts = native.work_counts(scene.to(torch.float32).inputs, camera.to(torch.float32), scene.settings)

@@ -17,7 +17,7 @@ from beags_plugin.rasterizers.torch_reference import BLOCK, TorchRasterizer
 
 
 def rotation(quat):
-    """Of a wxyz quaternion, by turning the axes: v' = v + 2 w (r x v) + 2 r x (r x v)."""
+    """Return the matrix of a wxyz quaternion, by turning the axes: v' = v + 2 w (r x v) + 2 r x (r x v)."""
     quat = quat / np.linalg.norm(quat)
     w, r = quat[0], quat[1:]
     return np.stack([v + 2 * w * np.cross(r, v) + 2 * np.cross(r, np.cross(r, v)) for v in np.eye(3)], axis=1)

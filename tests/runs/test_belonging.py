@@ -52,7 +52,7 @@ def test_the_end_of_a_training_decides_and_later_commands_do_not_ask_again(confi
     assert sorted(asked) == [1, 2]
     expected = {name: (23, LeftOut(outside=2)) for name in ("cup", "box")}
     assert left(config) == expected and sorted(asked) == [1, 2]
-    shutil.rmtree(open_run(config).data_path)  # not even the photos are needed
+    shutil.rmtree(open_run(config).data_path)  # The photos are not needed either.
     assert left(config) == expected
 
 

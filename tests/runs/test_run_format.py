@@ -20,7 +20,7 @@ REFUSED = "was written by an older version of beags: train again, or use the ver
 
 
 def first_format(text: str) -> str:
-    """What the first format's config.yml looks like: other modules, no version."""
+    """Return a config.yml as the first format wrote it: other modules, no version."""
     text = text.replace("beags_plugin.plugin.options.config.", "beags_plugin.plugin.config.")
     return without_version(text.replace("beags_plugin.plugin.views.", "beags_plugin.plugin."))
 

@@ -32,7 +32,7 @@ SOLIDS = {
 
 @pytest.mark.parametrize("name", SOLIDS)
 def test_first_hits_match_marching(name):
-    """Against fine steps along each ray through the inside test, which shares no code with the intersections."""
+    """Hits are compared with fine steps along each ray through the inside test, which shares no code with them."""
     solid = SOLIDS[name]
     generator = np.random.default_rng(1)
     origins = generator.normal(size=(60, 3))
@@ -155,7 +155,7 @@ def test_silhouettes_hold_the_visible_masks(scene):
 
 @pytest.mark.parametrize("class_id", range(1, 8))
 def test_a_removed_object_lets_through_what_stands_behind_it_in_the_same_light(scene, class_id):
-    """Against the scene described without it: what its rays meet has the colour that it has with the object there."""
+    """The scene described without it is the truth: what its rays meet keeps the colour that it has with the object."""
     still, views, pictures = scene
     light = FAMILIES["room" if isinstance(still, Room) else "tabletop"].light(still)
     rest = replace(still, things=tuple(t for i, t in enumerate(still.things, start=1) if i != class_id))
@@ -178,7 +178,7 @@ def test_a_removed_object_lets_through_what_stands_behind_it_in_the_same_light(s
 
 
 def test_on_a_turntable_objects_look_the_same_and_the_room_stands():
-    """Against the tabletop's pictures; and of two cameras on a circle, which see one picture of the room."""
+    """Pictures are compared with the tabletop's, and two cameras on a circle see one picture of the room."""
     table, still = FAMILIES["turntable"], FAMILIES["tabletop"]
     made = table.scene(0)
     views = table.views(0, WIDTH, HEIGHT, 6, 1)
@@ -200,7 +200,7 @@ def test_on_a_turntable_objects_look_the_same_and_the_room_stands():
 
 
 def test_what_photos_show_of_the_surface_behind_objects(scene):
-    """Against rays cast from each photo to each point: the first thing that they meet is the point."""
+    """A photo shows a point if a ray cast from it to the point meets nothing before the point."""
     still, views, pictures = scene
     photos = [Photo(v, still, p.depth) for v, p in zip(views, pictures, strict=True) if v.split == "train"]
     wrong, all_shown = [], []

@@ -14,7 +14,7 @@ from beags_plugin.sample.views import View
 
 
 def looking_down() -> View:
-    """From z = 4 straight down, 20 pixels to a world unit at z = 0."""
+    """Look straight down from z = 4, with 20 pixels to a world unit at z = 0."""
     pose = np.eye(4)
     pose[2, 3] = 4.0
     return View("v", "test", pose, 80.0, 20.0, 15.0, 40, 30)

@@ -207,7 +207,7 @@ def test_written_tracks_belong_to_the_points(folders):
 
 @pytest.mark.parametrize("moved", [0, 5])
 def test_tracks_agree_with_exact_geometry(family, moved):
-    """Against rays cast from every photo to every point, visitors included: nothing is met before the point."""
+    """A photo shows a point if a ray cast from it to the point meets nothing before it, visitors included."""
     made = FAMILIES[family]
     shots = [s for s in plan_shots(made, 0, made.views(0, 64, 48, 8, 1), 0.0, 0.0, moved) if s.view.split == "train"]
     pictures = [render_view(shot.scene, shot.light, shot.view, 1) for shot in shots]

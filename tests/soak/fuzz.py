@@ -44,10 +44,12 @@ from beags_plugin.rasterizers.rendering import draw_features
 from beags_plugin.system.progress import progress_bar
 
 OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion", "boundary")
-TOLERANCE = 1e-7  # of an output or gradient in float64, in units of the largest number expected, or of 1
-CANCELLED = 1e-4  # or of this share of the largest output: gradients are sums over 1,000 pixels of what cancels of it
+# Outputs and gradients in float64 may be off by TOLERANCE, in units of the largest number expected. The unit is at
+# least 1, and CANCELLED times the largest output: gradients are sums over 1,000 pixels, in which much of that cancels.
+TOLERANCE = 1e-7
+CANCELLED = 1e-4
 NUDGE = 1e-13  # relative change of every number of a scene, to see how far its own result moves
-NUDGE_OF_BOUND = 1e-10  # of the T at which compositing stops: T is a product of differences of nearly equal numbers
+NUDGE_OF_BOUND = 1e-10  # relative change of the T where compositing stops, a product of differences of near numbers
 NUDGES = 12  # an edge-on normal turns over in half of them: all alike is one case in 4,096
 FARTHER = 10.0  # the compiled code may differ by this many times what the reference moves by
 CHUNK = 25  # scenes that a process is handed at a time
@@ -55,7 +57,7 @@ CHUNK = 25  # scenes that a process is handed at a time
 
 @dataclass
 class Finding:
-    """What was found in one scene: ``failures`` and ``unclear``, sentences; ``spoilt``: in which ways."""
+    """Findings in one scene: ``failures`` and ``unclear`` hold sentences, ``spoilt`` the ways in which it is spoilt."""
 
     scene: int
     failures: list[str] = field(default_factory=list)

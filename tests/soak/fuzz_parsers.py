@@ -37,7 +37,7 @@ NAMES = (
     "transforms.json", "classes.json", "coco", "prompts", "experiment", "run config", "checkpoint", "checkpoint pickle",
     "voxel grid", "filed tensors", "mask", "mask rows",
 )  # fmt: skip
-SECONDS = 20  # of CPU time for one file
+SECONDS = 20  # seconds of CPU time for one file
 STUCK = 600  # seconds of wall time after which atheris takes a parser to be stuck
 MEMORY = 4 << 30  # bytes beyond what the libraries take
 LONGEST = 1 << 14  # bytes of a changed file

@@ -43,14 +43,14 @@ OPTIONS = {
     "pipeline.model.densify.max_surfels": 2500, "pipeline.model.prepare.k": 200, "steps_per_save": 5,
     "steps_per_held_out": 40, "vis": "tensorboard",
 }  # fmt: skip
-FORMATS = ("ply", "ply-2dgs", "compressed-ply", "sog", "spz", "html", "glb", "obj", "stl", "3mf")  # not usdz, an extra
+FORMATS = ("ply", "ply-2dgs", "compressed-ply", "sog", "spz", "html", "glb", "obj", "stl", "3mf")  # usdz needs an extra
 EXPORT = ("--all", "--format", *FORMATS, "--scale-by", "0,0,0 1,0,0 1 m", "--resolution", "32", "--min-views", "1")
 EXPORTS = ANY_TIME, IN_A_FILE = "export", "exported file"
-KINDS = ("step", "checkpoint", "anywhere", ANY_TIME, "step", "preparation", "anywhere", IN_A_FILE)  # in turn
-CHECKPOINTS = 20  # of a run, about
+KINDS = ("step", "checkpoint", "anywhere", ANY_TIME, "step", "preparation", "anywhere", IN_A_FILE)  # They take turns.
+CHECKPOINTS = 20  # about as many as a run writes
 STEPS = OPTIONS["pipeline.model.base_steps"] + OPTIONS["pipeline.model.refine_steps"]
-STEP_SECONDS = 0.05  # of a slow step, about
-ATTEMPTS = 20  # at a kill of one kind, as a run may end before its moment comes
+STEP_SECONDS = 0.05  # about what a slow step takes
+ATTEMPTS = 20  # tries of one kind of kill, as a run may end before its moment comes
 
 
 class Tester:

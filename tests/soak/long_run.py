@@ -30,7 +30,7 @@ from beags_benchmarks.provenance import commit, describe_machine  # noqa: E402
 from beags_plugin.sample.writer import SampleConfig, write_sample
 from beags_plugin.system.child_processes import bound
 
-NOISE_MB = 2.0  # what allocators and libraries move it by, with nothing kept; 1 kB a step would be as much
+NOISE_MB = 2.0  # Allocators and libraries move memory by this with nothing kept; 1 kB a step would be as much.
 COUNTED = ("threads", "files", "children")
 OBSERVED = Path(__file__).with_name("observed_training.py")
 

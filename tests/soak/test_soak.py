@@ -89,7 +89,8 @@ def test_a_training_leaves_nothing_behind(tmp_path):
     options = ("--steps-per-save", "40", "--steps-per-eval-image", "30", "--steps-per-held-out", "50")
     record = long_run.trained(tmp_path, 60, 90, 5, *options)
     _, failures = long_run.judged(record)
-    assert [line for line in failures if not line.startswith("memory")] == []  # too short to say how memory goes on
+    # The run is too short to say how memory goes on.
+    assert [line for line in failures if not line.startswith("memory")] == []
     assert record[-2]["step"] == 149 and record[-1]["phase"] == "after"
     assert any(".lock" in file for file in record[5]["files"])  # it sees what is held meanwhile
 

@@ -132,7 +132,7 @@ def test_an_official_file_is_rendered_as_its_numbers_say(tmp_path, thin_axis):
 
 @pytest.mark.parametrize("classes", [False, True])
 def test_what_is_exported_for_2dgs_has_its_columns_in_its_order(tmp_path, classes):
-    """With classes, they come behind what the official code asks for by name."""
+    """Classes, if there are any, come behind what the official code asks for by name."""
     surfels, path = random_surfels(degree=2), tmp_path / "cup.ply"
     if classes:
         make_exporter("ply-2dgs").write(path, ExportItem("cup", surfels, torch.ones(7, dtype=torch.int32)))

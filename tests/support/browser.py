@@ -34,10 +34,10 @@ NEEDED = pytest.mark.skipif(
     browser() is None,
     reason="there is no Chromium, so nobody looks at the viewer in a browser (Debian: apt install chromium)",
 )
-"""For tests that open a page."""
+"""Mark of tests that open a page."""
 
 
-SECONDS = 120.0  # after which a wait has failed; on a busy machine, most end long before
+SECONDS = 120.0  # A wait that takes longer has failed; most end long before, even on a busy machine.
 
 
 def _labelled(label: str) -> str:
@@ -114,7 +114,7 @@ class Page:
         self._send("Page.navigate", url=url)
         end = time.monotonic() + SECONDS
         while time.monotonic() < end:
-            with suppress(RuntimeError):  # between two pages there is none to answer
+            with suppress(RuntimeError):  # Between two pages, no page answers.
                 if self.evaluate("document.readyState == 'complete' && location.href") == url:
                     return
             time.sleep(0.2)
@@ -206,7 +206,7 @@ class Page:
             if self.chosen(label) == option:
                 return True
             if next(tries) % 10 == 0:  # again after a while: a panel that is put together anew closes the list
-                self.evaluate(f"{_labelled(label)}?.click()")  # not with the mouse: the panel may still be moving
+                self.evaluate(f"{_labelled(label)}?.click()")  # A mouse could miss: the panel may still be moving.
             self.evaluate(f"{listed}?.click()")
             return False
 

@@ -16,7 +16,7 @@ from beags_plugin.sample.solids import Solid
 from beags_plugin.sample.views import View
 from beags_plugin.surfaces.close_up import close_up
 
-C0 = 0.28209479177387814  # of the constant spherical harmonic
+C0 = 0.28209479177387814  # the constant spherical harmonic
 
 
 def thing_called(name: str) -> Thing[Solid]:

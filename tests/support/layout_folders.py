@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from data_folders import CX, CY, FX, FY, HEIGHT, WIDTH, noise, ring, write_colmap, write_image
 
-FOCAL = 32.0  # of the original images of LLFF and DTU
+FOCAL = 32.0  # focal length of the original images of LLFF and DTU
 
 
 def ids(class_id: int = 1, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:

@@ -26,7 +26,7 @@ def node_package(name: str, variable: str) -> Path | None:
 
 
 def by_node(program: str, *arguments: str | Path) -> Any:
-    """What a module of JavaScript prints as JSON in its last line."""
+    """Return what a module of JavaScript prints as JSON in its last line."""
     command = ["node", "--input-type=module", "-e", program, "--", *map(str, arguments)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stdout + result.stderr
@@ -77,7 +77,7 @@ const spz = await (await import(pathToFileURL(library + "/dist/spz.js"))).defaul
 
 
 def read_by_spz(path: Path) -> dict[str, Any]:
-    """What the reference library reads, in the axes of .ply files: lists by the names of its fields."""
+    """Return what the reference library reads, in the axes of .ply files: lists by the names of its fields."""
     program = (
         _OPEN
         + """

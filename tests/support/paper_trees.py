@@ -31,8 +31,8 @@ OBJECTS = {
     "lerf": ("green apple", "old camera"),
     "3dovs": ("red bag", "banana"),
 }
-MODEL_K = [[FX, 0.0, CX], [0.0, FY, CY], [0.0, 0.0, 1.0 / FACTOR]]  # of write_colmap
-BOUNDS_K = [[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0 / FACTOR]]  # of write_poses_bounds
+MODEL_K = [[FX, 0.0, CX], [0.0, FY, CY], [0.0, 0.0, 1.0 / FACTOR]]  # the K that write_colmap writes
+BOUNDS_K = [[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0 / FACTOR]]  # write_poses_bounds's K
 
 
 def cameras(count: int, K: list[list[float]]) -> list[Camera]:

@@ -98,7 +98,7 @@ def film(path: Path, pictures: list[np.ndarray]) -> Path:
 
 
 def look_alike(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether pictures [H, W, 3] are of one size and differ by a lossy format alone."""
+    """Return whether pictures [H, W, 3] are of one size and differ by a lossy format alone."""
     if one.shape != other.shape:
         return False
     return bool(np.abs(cv2.blur(one, (9, 9)).astype(int) - cv2.blur(other, (9, 9))).mean() < 4)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-STEPS = 45, 12  # of base and refinement
+STEPS = 45, 12  # steps of base and refinement
 
 
 class Killed(BaseException):

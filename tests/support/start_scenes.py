@@ -74,7 +74,7 @@ def with_volume(surfels: Surfels, thickness: float = 1e-3, seed: int = 0) -> tup
     rotations = rotation_from_quat(surfels.quats.double())
     thin = surfels.log_scales.amin(dim=1, keepdim=True) + float(np.log(thickness))
     scales = torch.cat([surfels.log_scales, thin], dim=1)
-    orders = [(0, 1, 2), (2, 0, 1), (1, 2, 0), (1, 0, 2)]  # where the axes u, v, n are found; the last is a mirror
+    orders = [(0, 1, 2), (2, 0, 1), (1, 2, 0), (1, 0, 2)]  # places of the axes u, v, n; the last is a mirror
     chosen = np.random.default_rng(seed).integers(len(orders), size=len(surfels))
     quats, log_scales = [], []
     for index, choice in enumerate(chosen):
@@ -102,7 +102,7 @@ def write_splatfacto(run: Path, surfels: Surfels, frame: tuple[torch.Tensor, flo
     content = {
         "step": step,
         "pipeline": {f"_model.gauss_params.{name}": value for name, value in state.items()},
-        "optimizers": {"means": {"state": {}, "param_groups": [{"lr": np.float64(1.6e-4)}]}},  # as nerfstudio's are
+        "optimizers": {"means": {"state": {}, "param_groups": [{"lr": np.float64(1.6e-4)}]}},  # nerfstudio has the same
         "schedulers": {},
         "scalers": {},
     }

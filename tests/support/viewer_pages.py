@@ -28,7 +28,7 @@ WIDTH, HEIGHT = 640, 400
 MAX_RESOLUTION = 512  # pixels of the longer side, the default of the viewer of a training
 COLORS = {name: colorize(np.array([[index]]))[0, 0].astype(int) for index, name in CLASSES.items()}
 HEARS = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"  # tests in the background ignore it
-ENTRY = f"{HEARS}; from nerfstudio.scripts.viewer.run_viewer import entrypoint; entrypoint()"  # what ns-viewer runs
+ENTRY = f"{HEARS}; from nerfstudio.scripts.viewer.run_viewer import entrypoint; entrypoint()"  # ns-viewer runs this
 
 
 def free_port() -> int:
@@ -57,7 +57,7 @@ def started(command: list[object], log: Path, ready: str) -> Iterator[subprocess
         process.terminate()
         process.wait(120)
     finally:
-        process.kill()  # where the test failed, or it did not end
+        process.kill()  # The test may have failed, or the process not ended.
         process.wait()
     assert "Traceback" not in log.read_text()
 

@@ -75,7 +75,7 @@ def test_a_box_without_bottom_is_closed_flat_and_keeps_its_sides():
 
 
 def test_a_closed_mesh_stays_so_where_readers_join_vertices_of_one_place(monkeypatch):
-    """As those of .stl must: the ragged rim of a hole draws several corners towards one place."""
+    """Readers of .stl must join them: the ragged rim of a hole draws several corners towards one place."""
     ragged = a_box(bottom=False)
     chips = np.random.default_rng(0).random(len(ragged.faces)) < 0.1
     ragged = replace(ragged, faces=ragged.faces[~(chips & (ragged.vertices[ragged.faces][:, :, 2] < 0.3).all(axis=1))])
@@ -132,7 +132,7 @@ def test_gaussians_close_the_hole_and_are_its_only_new_ones():
 
 
 def test_gaussians_that_close_keep_clear_of_the_outline():
-    """By more than where they are half transparent: there they would lift the object's own faint edge above 1/2."""
+    """The distance exceeds that of half transparency, where they would lift the object's own faint edge above 1/2."""
     own, sigma = discs_on(a_box(bottom=True)), 0.12
     x = HALF - sigma * torch.tensor([-1.0, 1.5, 4.0])
     means = torch.stack([x, torch.zeros(3), torch.full((3,), HALF)], dim=1)
@@ -214,7 +214,7 @@ def a_sheet(height: Callable[[np.ndarray, np.ndarray], np.ndarray], cells: int =
 
 @pytest.mark.parametrize("close", [False, True])
 def test_a_glb_marks_invented_vertices(tmp_path, close):
-    """As an attribute of glTF's own naming, which another project reads."""
+    """The mark is an attribute of glTF's own naming, which another project reads."""
     item = item_of(discs_on(a_box(bottom=False)), close)
     facts = make_exporter("glb", resolution=48, min_views=1).write(tmp_path / "box.glb", item)
     (read,) = trimesh.load(tmp_path / "box.glb", process=False).geometry.values()

@@ -41,7 +41,7 @@ def box_mesh(side: float, middle: float) -> Mesh:
 
 
 def is_open(discs: Surfels) -> torch.Tensor:
-    """Which discs of the box or the block no photo shows: undersides, and the lid below the block."""
+    """Return which discs of the box or the block no photo shows: undersides, and the lid below the block."""
     x, y, z = discs.means.T
     return (z < 0.01 - 0.4) | ((z - 0.4).abs() < 0.01) & (torch.maximum(x.abs(), y.abs()) < 0.15)
 
@@ -108,7 +108,7 @@ def test_a_hole_that_lies_open_stays_open(monkeypatch):
 
 @pytest.mark.slow("fuses the surfaces of a whole scene")
 def test_the_box_is_closed_and_not_lined_within():
-    """With nothing patched: drawn alone, it shows its inside through the hole, which would be taken for its surface."""
+    """Nothing is patched: drawn alone, the box shows its inside through the hole, which could pass for its surface."""
     surfels, ids, _ = stacked()
     views = Viewpoints([camera_at(eye, pixels=192) for eye in EYES], make_rasterizer("auto"), SETTINGS)
     options = MeshOptions(resolution=96, min_views=1)
@@ -143,13 +143,13 @@ def test_views_without_labels_say_nothing(monkeypatch):
 @pytest.mark.parametrize(
     ("shown", "depth", "hidden", "open_"),
     [
-        (BLOCK, 1.9, 1, 0),  # the neighbour, before the place
-        (BLOCK, 2.02, 0, 0),  # just behind it, within the error of depths
-        (BLOCK, 2.2, 0, 1),  # behind it: the view looks through
-        (0, 1.9, 0, 1),  # the background before it
-        (0, 2.0, 0, 0),  # at it: undecided
-        (0, 0.0, 0, 1),  # nothing at all there
-        (BOX, 1.9, 0, 0),  # its own object hides it
+        (BLOCK, 1.9, 1, 0),  # The neighbour lies before the place.
+        (BLOCK, 2.02, 0, 0),  # It lies just behind, within the error of depths.
+        (BLOCK, 2.2, 0, 1),  # The view looks through.
+        (0, 1.9, 0, 1),  # The background lies before it.
+        (0, 2.0, 0, 0),  # It lies at the place: undecided.
+        (0, 0.0, 0, 1),  # Nothing is there at all.
+        (BOX, 1.9, 0, 0),  # Its own object hides it.
         (IGNORE, 1.9, 0, 0),
     ],
 )
@@ -157,7 +157,7 @@ def test_what_a_view_says_of_a_place(shown, depth, hidden, open_):
     place = discs_on(box_mesh(0.8, 0.0))[:1]
     place.means[:], place.quats[:] = 0.0, torch.tensor([1.0, 0.0, 0.0, 0.0])  # It faces up.
     witnesses = Witnesses(place, torch.tensor([BOX], dtype=torch.int32))
-    for eye in ((0.01, 0.0, 2.0), (0.01, 0.0, -2.0), (2.0, 0.0, 0.01)):  # above, below, beside
+    for eye in ((0.01, 0.0, 2.0), (0.01, 0.0, -2.0), (2.0, 0.0, 0.01)):  # eyes above, below and beside it
         camera = camera_at(eye)
         size = camera.height, camera.width
         witnesses.add(camera, torch.full(size, shown, dtype=torch.int32), torch.full(size, depth))

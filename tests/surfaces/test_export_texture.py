@@ -49,7 +49,7 @@ def test_exposures_are_evened_out_and_colours_are_those_of_the_places(box):
     assert found.seen[top].mean() > 0.9 and not found.seen[below].any()
     right = srgb_from_linear(light_at(places.points) * np.exp(np.log(EXPOSURES).mean()))
     assert np.abs(found.colors - right)[found.seen].mean() < 0.005
-    assert np.abs(found.colors[below] - 0.9).max() < 1e-6  # what the splats say, where no photo shows anything
+    assert np.abs(found.colors[below] - 0.9).max() < 1e-6  # No photo shows these, so the splats' colour stays.
 
 
 def test_what_stands_before_the_object_leaves_no_colour(box):
@@ -130,7 +130,7 @@ PIXEL = 2.7 / 192  # approximate size of the photos' pixels at the box
 
 @pytest.mark.parametrize("inwards", [1.0, -1.0])
 def test_photos_place_a_surface_that_lies_a_pixel_off(box, inwards):
-    """Also with exposures that differ; the bottom, which no photo sees, goes along with what is beside it."""
+    """Exposures differ; the bottom, which no photo sees, goes along with what is beside it."""
     off = replace(box, vertices=box.vertices - inwards * PIXEL * vertex_normals(box))
     steps: list[tuple[int, int]] = []
     aligned, pixels = placed(off, photos_of(box), lambda *counts: steps.append(counts))

@@ -73,7 +73,7 @@ def test_a_fitted_texture_is_nearer_to_photos_that_it_was_not_given(box, photos)
 
 
 def test_textures_do_not_depend_on_the_number_of_threads(box, photos, monkeypatch):
-    """Nor do the solver's numbers before they are rounded, which tell more."""
+    """The solver's numbers before rounding, which tell more, do not depend on it either."""
     atlas, mean = mean_picture(box, photos)
     found: dict[int, list[np.ndarray]] = {1: [], 2: []}
     for threads, kept in found.items():

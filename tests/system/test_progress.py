@@ -42,7 +42,7 @@ def test_a_passing_bar_is_drawn_only_after_a_moment(capsys, monkeypatch, seconds
     with progress_bar("Counting sheep", passing=True) as update:
         for done in range(1, 5):
             update(done, 4)
-    assert started == [True] * 4 * drawn  # and is removed at the end
+    assert started == [True] * 4 * drawn  # The bar is removed at the end.
     assert "Counting" not in capsys.readouterr().out
 
 

@@ -138,7 +138,7 @@ def test_dots_in_a_name_without_suffix_belong_to_it(tmp_path):
 
 
 def test_no_photo_stands_for_two_names(tmp_path):
-    """Of two folders of equal names one is missing: its poses must not get the other's photos."""
+    """One of two folders with equal names is missing: its poses must not get the other's photos."""
     write_transforms(tmp_path, count=12)
     for index in range(12):
         (tmp_path / f"images/v{index:02d}.png").rename(tmp_path / f"images/{index % 8}.png")

@@ -45,7 +45,7 @@ def test_truth_without_a_photo_is_named_and_the_rest_counts(tmp_path, capsys):
     views = opened(data)
     note = f"3 of the 8 files in {truth} have the name of no photo that has a pose, and do not count, "
     assert views.stray_truth == note + "silhouettes/cup/w05.png among them: name them as their photos, or remove them."
-    assert " ".join(views.stray_truth.split()) in " ".join(capsys.readouterr().out.split())  # while training, too
+    assert " ".join(views.stray_truth.split()) in " ".join(capsys.readouterr().out.split())  # Training says it as well.
     assert views[0].silhouettes is not None and list(views[0].silhouettes) == [1]
 
 

@@ -22,7 +22,7 @@ def test_a_class_map_comes_back_to_its_photo(tmp_path, model):
     assert back.shape == given.shape and known.mean() > 0.7
     inner = known & (row % 20 > 1) & (row % 20 < 18) & (column % 20 > 1) & (column % 20 < 18)
     np.testing.assert_array_equal(back[inner], given[inner])
-    assert (back == given)[known].mean() > 0.93  # at borders the nearest pixel is taken twice
+    assert (back == given)[known].mean() > 0.93  # The nearest pixel is taken twice at borders.
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])

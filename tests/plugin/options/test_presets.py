@@ -30,7 +30,7 @@ def test_the_documented_presets_exist():
 
 
 def test_every_preset_is_a_name_of_ns_train():
-    """In the checkout's pyproject.toml, whatever is installed."""
+    """The checkout's pyproject.toml names all presets, whatever is installed."""
     file = ROOT / "pyproject.toml"
     if not file.exists():
         pytest.skip("no pyproject.toml beside the tests")

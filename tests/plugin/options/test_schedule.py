@@ -153,7 +153,7 @@ def test_official_learning_rates(model):
     assert rates(15_000) == pytest.approx({"means": 2.5 * 1.6e-5, **constant})
     assert rates(29_999) == pytest.approx({"means": 2.5 * 1.6e-6, **constant}, rel=1e-3)
     assert all(group["eps"] == 1e-15 for group in adam.param_groups)
-    configs["scales"]["optimizer"].eps = 1e-6  # not what Adam was made or loaded with
+    configs["scales"]["optimizer"].eps = 1e-6  # Adam was made and loaded with another.
     rates(0)
     assert [group["name"] for group in adam.param_groups if group["eps"] != 1e-15] == ["scales"]
     model.schedule = PhaseSchedule(30_000, 3_000, 30_000)

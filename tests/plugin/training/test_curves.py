@@ -175,7 +175,7 @@ def test_a_bad_held_out_mask_leaves_out_curves_only(data, tmp_path, monkeypatch,
 
 
 def wandb_history(folder):
-    """What wandb wrote to its own file in ``folder``, without a server: step to values by name."""
+    """Return what wandb wrote to its own file in ``folder``, without a server: step to values by name."""
     from wandb.proto import wandb_internal_pb2
     from wandb.sdk.internal.datastore import DataStore
 
@@ -228,7 +228,7 @@ def test_boundary_errors_are_means_over_the_pixels_of_a_class():
 
 
 def test_occupancy_violations_are_the_share_of_matter_outside():
-    """Against a plain sum over many points, from another generator."""
+    """Each share is compared with a plain sum over many points, from another generator."""
     surfels, ids = discs()
     grid = VisibilityGrid.from_points([(surfels.means[ids != 2], ids[ids != 2])], 0.05, torch.zeros(3), 3)
     found = occupancy_violations(surfels, ids, grid, seed=1, step=2, samples=400)

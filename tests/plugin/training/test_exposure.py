@@ -76,7 +76,7 @@ def manager_of(data: Path, **options) -> BeagsDataManager:
 
 @dataclass
 class Model:
-    """What exposures ask of a model."""
+    """Stand-in for a model, with what exposures ask of it."""
 
     exposure: str = "auto"
     exposures: Exposures | None = None
@@ -205,7 +205,7 @@ def test_transforms_are_learned_and_their_mean_stays_the_identity(folder, whole)
 
 
 def test_a_photo_is_pulled_towards_where_it_began():
-    """Without a gradient of the loss, what was moved goes back, the others stay where they were."""
+    """Without a gradient of the loss, exposures that were moved go back, and the others stay where they were."""
     model = Model()
     own = PhotoExposures(model, Exposures(("a", "b"), torch.eye(3, 4).repeat(2, 1, 1)))
     with torch.no_grad():

@@ -24,7 +24,7 @@ CAMERA = Camera(torch.eye(4), torch.tensor([[30.0, 0, 12], [0, 30.0, 10], [0, 0,
 
 
 class Model:
-    """What the curve asks of a model."""
+    """Stand-in for a model, with what the curve asks of it."""
 
     def __init__(self, rasterizer):
         g = torch.Generator().manual_seed(2)
@@ -75,7 +75,7 @@ def test_it_measures_all_held_out_views_at_the_given_steps_and_where_phases_end(
 
     last = records[-1]
     assert last["psnr"] == pytest.approx((psnr(0.4) + psnr(0.6)) / 2, rel=1e-5)
-    assert last["train_psnr"] == pytest.approx((psnr(0.1) + psnr(0.2)) / 2, rel=1e-5)  # As many views as are held out.
+    assert last["train_psnr"] == pytest.approx((psnr(0.1) + psnr(0.2)) / 2, rel=1e-5)  # It has as many views as psnr.
     greys = [torch.full((20, 24, 3), grey) for grey in (0.4, 0.6)]
     assert last["ssim"] == pytest.approx(sum(float(ssim(color, grey)) for grey in greys) / 2, rel=1e-5)
     assert last["gaussians"] == 9 and "psnr_fit" not in last

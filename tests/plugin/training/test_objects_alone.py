@@ -79,7 +79,7 @@ def test_what_surrounds_objects_changes_no_bit_and_a_killed_run_ends_alike(folde
 
 
 def test_black_objects_are_solid_and_nothing_else_is(folders):
-    """Before black alone, black objects may be empty space."""
+    """If the background were always black, black objects could stay empty space."""
     scene = read_run(folders / "run/config.yml")
     views = EvaluatedRun(folders / "run/config.yml").views
     for view in views:
@@ -120,7 +120,7 @@ def test_losses_move_depth_and_colour_in_their_pixels_alone():
 
 @pytest.mark.parametrize("contradict", [False, True])
 def test_a_run_says_that_its_background_contradicts_itself(tmp_path, capsys, contradict):
-    """On photos of the very scene that it starts from, as they are and with other noise around the objects in each."""
+    """The photos are of the very scene that it starts from, as they are or with other noise around the objects."""
     write_drawn_scene(tmp_path / "data")
     for index in range(9 if contradict else 0):
         ids = np.asarray(Image.open(tmp_path / f"data/masks/v{index:02d}.png"))

@@ -98,7 +98,7 @@ def contents(folder):
 
 @pytest.mark.parametrize("again", ["resume", "ns-train"])
 def test_a_run_that_is_training_is_left_alone(data, whole, tmp_path, again):
-    """Also by ns-train, which writes config.yml first."""
+    """Resuming is refused, and so is ns-train, which writes config.yml first."""
     import fcntl
 
     from beags_plugin.system.lock import LOCK, run_lock
@@ -122,7 +122,7 @@ def test_the_lock_is_held_from_the_first_file_on(data, tmp_path):
 
     config = short_config(data, tmp_path / "run")
     config.save_config()
-    config.save_config()  # not refused by itself
+    config.save_config()  # It is not refused by itself.
     with pytest.raises(Timeout):
         FileLock(tmp_path / "run" / LOCK).acquire(blocking=False)
     run_lock(tmp_path / "run").release()  # the trainer takes it over so
@@ -130,7 +130,7 @@ def test_the_lock_is_held_from_the_first_file_on(data, tmp_path):
 
 
 def test_ctrl_c_after_the_end_is_quiet(data, tmp_path, monkeypatch, capsys):
-    """As in a viewer that stays open."""
+    """A viewer that stays open after the training is ended so."""
     from nerfstudio.engine.trainer import Trainer
 
     run = tmp_path / "run"

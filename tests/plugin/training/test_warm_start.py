@@ -104,7 +104,7 @@ def test_a_run_of_the_same_frame_is_taken_bit_for_bit(scene, tmp_path):
 
 @pytest.mark.parametrize("form", ["ply", "ply-2dgs"])
 def test_a_base_is_exported_whole_and_started_from_again(scene, tmp_path, form):
-    """Through the world of the input poses and back: the training views are as they were."""
+    """The scene goes to the world of the input poses and back: the training views are as they were."""
     from beags_plugin.commands.cli import main
 
     start = write_splatfacto(tmp_path / "a", in_frame(scene.surfels, a_frame(4)), a_frame(4))

@@ -240,7 +240,7 @@ def test_masks_are_saved_for_training_views_and_never_over_others(opened, capsys
 
 
 def test_masks_are_saved_for_photos_that_were_named_when_the_viewer_was_opened(opened, tmp_path):
-    """As by ``beags view RUN --data X``, where those that the run was trained on are gone."""
+    """``beags view RUN --data X`` names them where the photos that the run was trained on are gone."""
     tab, config = opened()
     moved = tmp_path / "photos elsewhere"
     (config.parent.parent / "lab").rename(moved)
@@ -272,7 +272,7 @@ def test_the_command_has_the_runs_options_of_its_data():
 
 
 def test_the_other_sides_of_a_cut_are_shown_before_it_is_saved(opened):
-    """From the sides from which nobody has clicked, the cut is in its colour."""
+    """The sides from which nobody has clicked show the cut in its colour."""
     tab, _ = opened()
     assert tab._sides.content == ""
     click(tab, POINTS["low"], "Gaussians")

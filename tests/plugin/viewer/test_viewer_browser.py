@@ -87,7 +87,8 @@ def test_the_sliders_fade_and_thin_out(page):
     page.choose("Output type", "class_map")
     classes = awaited(page, lambda now: painted(now, "cup") > 0.01 < painted(now, "box"))
     page.choose("Output type", "accumulation")
-    whole = awaited(page, lambda now: differing(now, classes) > 0.01 and varied(now) > 2)  # not what was there before
+    # The picture is no longer the one before.
+    whole = awaited(page, lambda now: differing(now, classes) > 0.01 and varied(now) > 2)
     empty = slid(page, "Least opacity", 0.97, lambda now: varied(now) < 1)
     slid(page, "Least opacity", 0.9, lambda now: differing(now, whole) < 0.1 * differing(empty, whole))
     page.choose("Object", "box")
@@ -102,7 +103,7 @@ def middle_of(seen: np.ndarray, name: str) -> tuple[float, float]:
 
 
 def test_the_mouse_turns_the_camera_and_picks_when_asked_to(page):
-    """As shipped: either button of the mouse turns or moves; the pick takes one click; then the mouse turns again."""
+    """Either button of the mouse turns or moves, as shipped; the pick takes one click; then the mouse turns again."""
     page.choose("Output type", "class_map")
     seen = awaited(page, lambda now: painted(now, "cup") > 0.01 < painted(now, "box"))
     for name in ("box", "cup"):

@@ -236,7 +236,7 @@ def test_a_camera_at_its_place_sees_all_objects_from_the_side_of_a_photo(aspect)
     [(0.0, 1e-6, 181), (0.03, 1e-7, 362), (0.3, 5e-7, 256), (0.3, 2e-5, 128), (0.001, 1e-9, 400), (0.0, 1e-3, 32)],
 )
 def test_pictures_are_as_large_as_the_pace_allows(fixed, each, height):
-    """Of ``fixed`` seconds and ``each`` per pixel: as many pixels as fit; no smaller where that would gain little.
+    """A picture takes ``fixed`` seconds and ``each`` per pixel: as many pixels as fit, no fewer if that gains little.
 
     The processor's time is longer for the first picture; the still pictures between are of another size.
     """

@@ -132,7 +132,7 @@ def test_order_of_views_follows_the_seed_alone(tmp_path):
     write_transforms(tmp_path)
 
     def orders(seed: int) -> tuple[list[int], list[int]]:
-        random.seed()  # whatever state others leave
+        random.seed()  # Others may leave any state.
         data = manager(tmp_path, train_cameras_sampling_seed=seed)
         state = random.getstate()
         train = [data.next_train(step)[1]["image_idx"] for step in range(21)]

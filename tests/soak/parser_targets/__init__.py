@@ -8,4 +8,4 @@ from parser_targets.target import Target, examine
 __all__ = ["TARGETS", "Target", "examine"]
 
 TARGETS = points.TARGETS | poses.TARGETS | texts.TARGETS | tensors.TARGETS | images.TARGETS
-"""By name."""
+"""Parsers by name."""
