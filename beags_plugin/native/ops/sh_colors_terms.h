@@ -15,7 +15,7 @@ constexpr double kC0 = 0.28209479177387814, kC1 = 0.4886025119029199;
 constexpr double kC20 = 1.0925484305920792, kC21 = 0.31539156525252005, kC22 = 0.5462742152960396;
 constexpr double kC30 = 0.5900435899266435, kC31 = 2.890611442640554, kC32 = 0.4570457994644658,
                  kC33 = 0.3731763325901154, kC34 = 1.445305721320277;
-constexpr double kLeastDistance = 1e-12;  // for a Gaussian at the camera
+constexpr double kLeastDistance = 1e-12;  // distance that a Gaussian at the camera is taken to have
 
 template <class T>
 struct Direction {

@@ -47,9 +47,9 @@ class VoxelVotes {
     uint32_t votes;
   };
   struct alignas(64) Brick {
-    // After `decide`, a bit for each voxel. Of the class `label`: more than half of the voxel's votes and of those of
-    // all that have any among the eight voxels around a point in it, by the eighth of the voxel that holds the point
-    // (bits 4, 2, 1: the upper half along x, y, z).
+    // After `decide`, a bit for each voxel: whether the class `label` has more than half of its votes, and of those of
+    // every voxel with votes among the eight around a point in it. The index is the eighth of the voxel that holds the
+    // point (bits 4, 2, 1: the upper half along x, y, z).
     uint64_t agreed[8] = {};
     uint64_t pure = 0;   // voxels with votes for `label` alone
     uint64_t voted = 0;  // voxels with votes

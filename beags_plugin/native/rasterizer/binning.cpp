@@ -78,7 +78,7 @@ bool find_tiles(const View& view, const Splat<T>& splat, std::vector<Reach>& out
       last = std::max(last, bands.last[row]);
     }
     for (int origin = first / kGroup * kGroup; origin <= last; origin += kWordGroups) {
-      uint64_t rows[kGroup];  // for each row of groups, the reached ones from `origin` on
+      uint64_t rows[kGroup];  // the reached groups of each row, from `origin` on
       for (int row = 0; row < kGroup; ++row) {
         const int from = std::max(bands.first[row] - origin, 0);
         const int to = std::min(bands.last[row] - origin, kWordGroups - 1);

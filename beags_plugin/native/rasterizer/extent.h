@@ -10,7 +10,7 @@
 
 namespace beags {
 
-// For each of a tile's four rows of groups, the columns of groups that a Gaussian reaches; first > last: none.
+// The columns of groups that a Gaussian reaches in each of a tile's four rows of groups; first > last: none.
 struct Bands {
   int first[kGroup], last[kGroup];
 };

@@ -141,7 +141,7 @@ struct Query {
   const int32_t* slots;       // class_contributions: [height, width] index of the pixel's label in its tile, or -1
   const int32_t* num_slots;   // [tiles]
   const int64_t* slot_start;  // [tiles] into sums
-  T* sums;                    // for each tile t: [pairs of t, num_slots[t]]
+  T* sums;                    // [pairs of t, num_slots[t]] for each tile t
   T min_weight;               // class_pixel_counts: pixels of larger w count
   int most, within;           // top_contributions: number of largest w that count, among the first ones of a pixel
   Contribution<T>* found;     // top_contributions: room for 256 times `within`, or times the pairs of t if fewer

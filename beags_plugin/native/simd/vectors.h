@@ -44,7 +44,7 @@ using Real2D = Vectors<double, 16>::Real;
 using Real8F = Vectors<float, 32>::Real;
 using Real4D = Vectors<double, 32>::Real;
 
-// What the vector extensions lack: for any instruction set, then with its instructions.
+// Operations that the vector extensions lack, first for any instruction set, then with the instructions of some.
 template <class R>
 BEAGS_INLINE R fused(R a, R b, R c) {
   return a * b + c;

@@ -95,7 +95,7 @@ struct Block {
   std::unique_ptr<unsigned char[]> stacks{new unsigned char[kMostThreads * kSets * kStack]};
   const std::function<void()>* body = nullptr;
   unsigned block = 0, threads = 0, current = 0;
-  int voted = 0, votes = 0;  // at a barrier: threads that voted yes so far; the result
+  int voted = 0, votes = 0;  // threads that voted yes at a barrier so far; the result
   Grid grid;
 #if defined(__x86_64__)
   void* scheduler = nullptr;
@@ -147,7 +147,7 @@ BEAGS_UNSEEN inline void start(unsigned thread) {
   unsigned char* stack = b.stacks.get() + (set * kMostThreads + thread) * kStack;
 #if defined(__x86_64__)
   void** top = reinterpret_cast<void**>(reinterpret_cast<uintptr_t>(stack + kStack) & ~uintptr_t(15));
-  *--top = nullptr;  // in place of a return address
+  *--top = nullptr;  // This null takes the place of a return address.
   *--top = reinterpret_cast<void*>(&run_fiber);
   for (int i = 0; i < 6; ++i) *--top = nullptr;
   fiber.stack_pointer = top;

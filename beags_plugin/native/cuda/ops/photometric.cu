@@ -42,7 +42,7 @@ BEAGS_DEVICE void blur_across(const T (&window)[kSsimWindow], const T (&maps)[kM
 
 template <class T>
 __global__ void __launch_bounds__(kSideThreads) photometric_kernel(PhotometricJob<T> job) {
-  __shared__ T pictures[2][kHalo][kHalo * kChannels];  // with zeros outside the image
+  __shared__ T pictures[2][kHalo][kHalo * kChannels];  // zeros outside the image
   __shared__ T down[4][kSide][kHalo];
   const PhotometricTile tile(job.width, job.height);
   const int64_t line = static_cast<int64_t>(job.width) * kChannels, map = job.height * line;

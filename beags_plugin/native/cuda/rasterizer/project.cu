@@ -125,7 +125,7 @@ __global__ void tile_start_kernel(int tiles, int64_t capacity, const int64_t* to
   }
 }
 
-int bits_for(int values) {  // so many that all ones is not a value
+int bits_for(int values) {  // bits for the numbers below `values`, of which none is all ones
   int bits = 1;
   while ((1 << bits) - 1 < values) ++bits;
   return bits;
