@@ -213,7 +213,7 @@ def rendering_rows(size: Size, repeats: int, gsplat: bool) -> list[dict[str, Any
         try:
             scene = scene or on_device(make_scene(size), DEVICE)
             rows.append(rendering_row(scene, kind(scene), name, repeats))
-        except Exception as error:  # also errors of other libraries: earlier rows must not be lost
+        except Exception as error:  # Whatever another library raises, earlier rows must not be lost.
             rows.append({**size_of(size), "backend": name, "failed": failure(error)})
         print(rows[-1], flush=True)
         torch.cuda.empty_cache()

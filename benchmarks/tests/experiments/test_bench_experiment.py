@@ -23,7 +23,7 @@ def experiment(tmp_path):
     return load_experiment(written(tmp_path, GOOD))
 
 
-WITH_QUALITY = [name for name in experiment_names() if name != "classes"]  # which measures cost alone
+WITH_QUALITY = [name for name in experiment_names() if name != "classes"]  # classes measures cost alone
 # experiments whose figures are reported; by all others something is chosen
 REPORTING = {"presets", "compare", "compare-consistent"}
 

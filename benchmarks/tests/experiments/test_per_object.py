@@ -41,7 +41,7 @@ def test_a_trial_for_each_object(tmp_path):
 
 
 def result(own: float, other: float, masks: list[tuple[str, float]], **figures) -> dict:
-    """Of a scene in which the object "cup" has the BIoU ``own``, and "box" ``other``."""
+    """Return the result of a scene in which "cup" has the BIoU ``own``, and "box" ``other``."""
 
     def of(value):
         return {

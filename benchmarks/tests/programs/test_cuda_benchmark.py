@@ -20,7 +20,7 @@ SCRIPT = ROOT / "scripts" / "gpu_check.sh"
 
 
 def test_rows_of_renderings_and_steps(monkeypatch, tmp_path, capsys):
-    """On the CPU, of tiny scenes; the clock only calls what it is given."""
+    """Tiny scenes are measured on the CPU; the clock only calls what it is given."""
     if (reason := EmulatedCudaRasterizer.unavailable()) or (reason := extension.status()[1]):
         pytest.skip(reason)
     monkeypatch.setattr(cuda, "DEVICE", "cpu")
