@@ -11,11 +11,11 @@ from torch import Tensor
 from beags_plugin.core.flattening import Gaussians
 from beags_plugin.core.sh import sh_basis
 from beags_plugin.importers.base import ImportedScene, Importer
+from beags_plugin.splat_io.frames import TRANSFORM_FILE, read_transform
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.tensors import load_tensors
-from beags_plugin.system.reading.text import load_json, reason
+from beags_plugin.system.reading.text import reason
 
-_TRANSFORM = "dataparser_transforms.json"  # nerfstudio's file with the normalisation of poses
 _PREFIX = "_model.gauss_params."
 
 
@@ -37,10 +37,10 @@ class CheckpointImporter(Importer):
         gaussians = _gaussians(checkpoint)
         flat = gaussians.log_scales.shape[1] == 2
         run = checkpoint.absolute().parent.parent
-        normalization = _normalization(run / _TRANSFORM)
+        normalization = read_transform(run)
         note = ""
         if normalization is None:
-            note = f"{run / _TRANSFORM} is missing, so {checkpoint.name} is taken to lie in this run's own frame."
+            note = f"{run / TRANSFORM_FILE} is missing, so {checkpoint.name} is taken to lie in this run's own frame."
         return ImportedScene("run of beags" if flat else "run of splatfacto", gaussians, normalization, note)
 
 
@@ -53,19 +53,6 @@ def _newest(path: Path) -> Path | None:
         if checkpoints := sorted(folder.glob("step-*.ckpt")):
             return checkpoints[-1]
     return None
-
-
-def _normalization(file: Path) -> tuple[Tensor, float] | None:
-    try:
-        content = load_json(file)
-        transform, scale = torch.tensor(content["transform"], dtype=torch.float64), float(content["scale"])
-        if transform.shape != (3, 4):
-            raise ValueError(f"its transform is {list(transform.shape)}, not [3, 4]")
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{file} cannot be read ({reason(error)}): restore it.") from error
-    return transform, scale
 
 
 def _gaussians(checkpoint: Path) -> Gaussians:

@@ -13,7 +13,6 @@ BASE_SNAPSHOT = "base"  # Folder with the scene that refinement started from.
 PREPARED = "prepared"  # Folder with the masks and grids of refinement.
 EXTRACTION_FILE = "extraction.json"  # An extracted run names here its origin and its object.
 REPORT_FILE = "training.json"  # A complete run has here seconds, memory and a refiner's own figures.
-TRANSFORM_FILE = "dataparser_transforms.json"  # nerfstudio writes the normalisation of the poses here.
 
 
 def newest_checkpoint(folder: Path) -> Path:

@@ -1,26 +1,20 @@
-"""Read parts of runs: the trained scene, and the frame it was trained in."""
+"""Read parts of runs: the trained scene, and the options of its views."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-
-import torch
-from torch import Tensor
 
 from beags_plugin.core.exposure import Exposures
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.runs.checkpoint_file import exposures_of, model_state, read_checkpoint
-from beags_plugin.runs.layout import TRANSFORM_FILE, newest_checkpoint
+from beags_plugin.runs.layout import newest_checkpoint
 from beags_plugin.runs.picked import with_picked
 from beags_plugin.runs.relocation import open_run
 from beags_plugin.runs.run_config import RunConfig
-from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.text import load_json, reason
 from beags_plugin.views.data_options import RunViewOptions
 
 
@@ -80,26 +74,6 @@ def read_scene(config: RunConfig, config_path: Path) -> SavedScene:
 def read_run(config_path: Path) -> SavedScene:
     """Open a run and read only its scene."""
     return read_scene(open_run(config_path), config_path)
-
-
-def read_transform(run: Path) -> tuple[Tensor, float] | None:
-    """Read the data parser's transform ([3, 4], scale) of a run; None if the run has no file of it.
-
-    Raises ``UserError`` if the file is damaged.
-    """
-    path = run / TRANSFORM_FILE
-    if not path.exists():
-        return None
-    try:
-        content = load_json(path)
-        transform, scale = torch.tensor(content["transform"], dtype=torch.float64), float(content["scale"])
-        if transform.shape != (3, 4):
-            raise ValueError(f"its transform is {list(transform.shape)}, not [3, 4]")
-        if not (bool(transform.isfinite().all()) and 0 < scale < math.inf):
-            raise ValueError("it holds NaN or infinity, or a scale that is not above 0")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path} cannot be read ({reason(error)}): restore it.") from error
-    return transform, scale
 
 
 def view_options(config: RunConfig) -> RunViewOptions:

@@ -12,9 +12,10 @@ from torch import Tensor
 
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
-from beags_plugin.runs.read import SavedScene, read_scene, read_transform, view_options
+from beags_plugin.runs.read import SavedScene, read_scene, view_options
 from beags_plugin.runs.relocation import check_data, open_run
 from beags_plugin.runs.run_config import RunConfig
+from beags_plugin.splat_io.frames import read_transform
 from beags_plugin.surfaces.frames import Frame
 from beags_plugin.surfaces.item import Viewpoints
 from beags_plugin.system.errors import UserError

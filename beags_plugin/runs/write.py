@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from beags_plugin.options.run_format import CONFIG_FILE
-from beags_plugin.runs.layout import TRANSFORM_FILE
 from beags_plugin.runs.relocation import AnyConfig
+from beags_plugin.splat_io.frames import TRANSFORM_FILE
 from beags_plugin.system.whole_files import write_text_atomically, write_whole
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -12,8 +13,30 @@ from beags_plugin.core.rotations import quat_product
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.reading.text import load_json, reason
 
+TRANSFORM_FILE = "dataparser_transforms.json"  # nerfstudio writes the normalisation of the poses here.
 _ORTHONORMAL_TOLERANCE = 1e-4  # The matrices passed through JSON as float32.
+
+
+def read_transform(run: Path) -> tuple[Tensor, float] | None:
+    """Read the data parser's transform ([3, 4], scale) of a run; None if the run has no file of it.
+
+    Raises ``UserError`` if the file is damaged.
+    """
+    path = run / TRANSFORM_FILE
+    if not path.exists():
+        return None
+    try:
+        content = load_json(path)
+        transform, scale = torch.tensor(content["transform"], dtype=torch.float64), float(content["scale"])
+        if transform.shape != (3, 4):
+            raise ValueError(f"its transform is {list(transform.shape)}, not [3, 4]")
+        if not (bool(transform.isfinite().all()) and 0 < scale < math.inf):
+            raise ValueError("it holds NaN or infinity, or a scale that is not above 0")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} cannot be read ({reason(error)}): restore it.") from error
+    return transform, scale
 
 
 def to_input_frame(surfels: Surfels, transform: Tensor, scale: float) -> Surfels:

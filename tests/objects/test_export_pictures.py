@@ -26,9 +26,9 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.objects.evaluate import EvaluatedRun
 from beags_plugin.plugin.options.config import base_config
 from beags_plugin.rasterizers.rendering import surfel_inputs
-from beags_plugin.runs.layout import TRANSFORM_FILE
 from beags_plugin.runs.write import write_run
 from beags_plugin.sample.views import View, make_views
+from beags_plugin.splat_io.frames import TRANSFORM_FILE
 
 WIDTH, HEIGHT = 640, 480
 OBJECTS = {class_id: name for class_id, name in CLASSES.items() if class_id}

@@ -24,7 +24,8 @@ from beags_plugin.core.select import select_class
 from beags_plugin.export.pose_options import PhotoPoint
 from beags_plugin.objects.pose import _pixel
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.runs.read import read_run, read_transform
+from beags_plugin.runs.read import read_run
+from beags_plugin.splat_io.frames import read_transform
 from beags_plugin.surfaces.frames import Frame
 from beags_plugin.surfaces.item import Viewpoints
 from beags_plugin.system.errors import UserError

@@ -17,7 +17,7 @@ trimesh = pytest.importorskip("trimesh")
 open3d = pytest.importorskip("open3d")
 
 from beags_plugin.commands.cli import main
-from beags_plugin.runs.layout import TRANSFORM_FILE
+from beags_plugin.splat_io.frames import TRANSFORM_FILE
 from beags_plugin.surfaces.color import srgb_from_linear
 from beags_plugin.system.reading.ply import read_vertices
 

@@ -41,7 +41,8 @@ from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.runs.picked import PICKED_FILE
-from beags_plugin.runs.read import read_run, read_transform
+from beags_plugin.runs.read import read_run
+from beags_plugin.splat_io.frames import read_transform
 from beags_plugin.splat_io.ply import write_ply
 from beags_plugin.system.errors import UserError
 
