@@ -41,7 +41,8 @@ class Things:
         if self.found < self.asked:
             count = "Only one separate thing was" if self.found == 1 else f"Only {self.found} separate things were"
             return f"{count} found, not {self.asked}: click on things that touch, or that most masks lack."
-        more = f"{self.more} more separate things were found and became background: ask for {self.found + self.more}."
+        count = "One more separate thing was" if self.more == 1 else f"{self.more} more separate things were"
+        more = f"{count} found and became background: ask for {self.found + self.more}."
         return more if self.more else ""
 
 

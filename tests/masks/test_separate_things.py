@@ -80,7 +80,8 @@ def test_things_beyond_those_asked_for_are_background_and_said(scene):
     left_out = 1 if of[1] == 0 else 3
     for mask, true in zip(separated_labels(found, surfels, CAMERAS, given, rasterizer, SETTINGS), exact, strict=True):
         assert mask is not None and float((mask[true == left_out] == 0).float().mean()) > 0.8
-    assert found.things.sentence() == "1 more separate things were found and became background: ask for 3."
+    assert found.things.sentence() == "One more separate thing was found and became background: ask for 3."
+    assert Things(2, 2, 2).sentence() == "2 more separate things were found and became background: ask for 4."
 
 
 def test_things_that_touch_stay_one_and_that_is_said():
