@@ -71,7 +71,7 @@ class CobGsRefiner(Refiner):
         if self.object:
             check_choice(self.object, [name for c, name in names.items() if c != BACKGROUND], "object")
 
-    def steps(self, asked: int, views: int, objects: int) -> int:
+    def steps(self, requested: int, views: int, objects: int) -> int:
         return mask_logits.EPOCHS * views * self.texture_phases * (1 if self.object else objects)
 
     def own_training(self, scene: TrainedScene) -> OwnTraining:

@@ -43,8 +43,8 @@ class GaussianGroupingRefiner(Refiner):
         if not 0.0 <= self.threshold < 1.0:
             raise UserError(f"threshold is {self.threshold:g}: give a probability, from 0 to below 1.")
 
-    def steps(self, asked: int, views: int, objects: int) -> int:
-        return asked
+    def steps(self, requested: int, views: int, objects: int) -> int:
+        return requested
 
     def own_training(self, scene: TrainedScene) -> OwnTraining:
         return IdentityTraining(scene, self)

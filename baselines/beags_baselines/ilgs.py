@@ -64,8 +64,8 @@ class IlgsRefiner(Refiner):
         if not 0.0 <= self.weight < math.inf:
             raise UserError(f"weight is {self.weight:g}: give the weight of a loss, 0 or more.")
 
-    def steps(self, asked: int, views: int, objects: int) -> int:
-        return asked
+    def steps(self, requested: int, views: int, objects: int) -> int:
+        return requested
 
     def own_training(self, scene: TrainedScene) -> OwnTraining:
         return IlgsTraining(scene, self)

@@ -70,8 +70,8 @@ class InstaSceneRefiner(Refiner):
                 f"{len(names)}: leave it out."
             )
 
-    def steps(self, asked: int, views: int, objects: int) -> int:
-        return asked
+    def steps(self, requested: int, views: int, objects: int) -> int:
+        return requested
 
     def own_training(self, scene: TrainedScene) -> OwnTraining:
         return ContrastTraining(scene, self)

@@ -71,8 +71,8 @@ class ObjectGsRefiner(Refiner):
     def joins_base(self) -> bool:
         return self.joint
 
-    def steps(self, asked: int, views: int, objects: int) -> int:
-        return 0 if self.joint else asked
+    def steps(self, requested: int, views: int, objects: int) -> int:
+        return 0 if self.joint else requested
 
     def seed_classes(self, scene: TrainedScene) -> Tensor:
         points = scene.surfels().means.detach()

@@ -75,8 +75,8 @@ class OpenGaussianRefiner(Refiner):
         if not self.max_scale > 0.0:
             raise UserError(f"max_scale is {self.max_scale:g}: give a length above 0, or inf.")
 
-    def steps(self, asked: int, views: int, objects: int) -> int:
-        return asked
+    def steps(self, requested: int, views: int, objects: int) -> int:
+        return requested
 
     def own_training(self, scene: TrainedScene) -> OwnTraining:
         return CodebookTraining(scene, self)

@@ -59,8 +59,8 @@ class Trace3DRefiner(Refiner):
             if not least <= (value := getattr(self, name)) <= 1.0:
                 raise UserError(f"{name} is {value:g}: give a share, {least:g} to 1.")
 
-    def steps(self, asked: int, views: int, objects: int) -> int:
-        return asked
+    def steps(self, requested: int, views: int, objects: int) -> int:
+        return requested
 
     def own_training(self, scene: TrainedScene) -> OwnTraining:
         return TraceTraining(scene, self)

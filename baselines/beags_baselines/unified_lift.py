@@ -49,8 +49,8 @@ class UnifiedLiftRefiner(Refiner):
         if self.codes < len(names):
             raise UserError(f"codes is {self.codes}, but there are {len(names)} classes: give as many codes at least.")
 
-    def steps(self, asked: int, views: int, objects: int) -> int:
-        return asked
+    def steps(self, requested: int, views: int, objects: int) -> int:
+        return requested
 
     def own_training(self, scene: TrainedScene) -> OwnTraining:
         return CodebookTraining(scene, self)

@@ -73,13 +73,13 @@ class Refiner:
         """Raise ``UserError`` for options that do not fit the classes; names: by id, background (0) included."""
         return None
 
-    def steps(self, asked: int, views: int, objects: int) -> int:
+    def steps(self, requested: int, views: int, objects: int) -> int:
         """Return the number of steps of refinement.
 
-        asked: the option ``refine_steps``. views: number of training views. objects: number of classes but the
+        requested: the option ``refine_steps``. views: number of training views. objects: number of classes but the
         background.
         """
-        return asked if self.trains else 1  # This one step changes nothing.
+        return requested if self.trains else 1  # This one step changes nothing.
 
     def build_grid(self, scene: AssignedScene, k: int, progress: Progress | None = None) -> VisibilityGrid | None:
         """Build the visibility voxel grid of the refiner's losses (``k`` as in E8), or None if they need none."""

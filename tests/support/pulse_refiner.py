@@ -37,8 +37,8 @@ class PulseRefiner(Refiner):
         if self.object:
             check_choice(self.object, [name for c, name in names.items() if c != BACKGROUND], "object")
 
-    def steps(self, asked: int, views: int, objects: int) -> int:
-        return asked
+    def steps(self, requested: int, views: int, objects: int) -> int:
+        return requested
 
     def own_training(self, scene: TrainedScene) -> OwnTraining:
         return PulseTraining(scene, self)
