@@ -119,7 +119,7 @@ def things_apart(scene: MadeScene, output: Path, base: Path, objects: int) -> Ma
     former = read_object(stamp)
     if former.get("of") == made_of and any(masks.rglob("*.png")):
         CONSOLE.print(f"Separated before: {masks}.")
-    elif former and former.get("masks") != folder_digest(masks):
+    elif stamp.exists() and former.get("masks") != folder_digest(masks):  # Masks beside a damaged stamp may be mended.
         CONSOLE.print(f"The masks in {masks} were mended, so they stay: delete {folder} for new ones.")
     else:
         shutil.rmtree(folder, ignore_errors=True)

@@ -14,6 +14,7 @@ from run_folders import write_scene
 
 from beags_plugin.commands import demo, demo_picks, demo_training
 from beags_plugin.commands.cli import main
+from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.objects import picked_masks
 from beags_plugin.system.errors import UserError
 
@@ -111,6 +112,12 @@ def test_things_that_lie_apart_are_told_apart_on_the_base_and_masks_of_them_that
     write_image(stand.output / "apart/masks/v01.png", np.full((60, 100), 7, np.uint8))
     assert stand.run(True, pick=False, objects=3) == ["refined", "measured"]
     assert "were mended, so they stay" in capsys.readouterr().out
+    mended = {stand.output / f"{name}/masks/v01.png": name for name in ("made", "apart")}
+    for path, name in mended.items():
+        write_image(path, np.full((60, 100), 8, np.uint8))
+        (path.parents[1] / f"{name}.json").write_text("{")  # a damaged stamp
+    assert stand.run(True, pick=False, objects=3) == ["refined", "measured"]
+    assert all(np.unique(read_id_mask(path)).tolist() == [8] for path in mended)
 
 
 def test_masks_that_nobody_made_here_hold_no_things_to_tell_apart(stand, tmp_path):
