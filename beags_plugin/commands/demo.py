@@ -89,7 +89,7 @@ def run_demo(
         names = names_of(data, objects)
         scene = _trained_on_base(
             scene, output, request, fresh, seconds, {"pick": True},
-            lambda base: picked_scene(scene, output, base, names, fresh, again),
+            lambda base: picked_scene(scene, base, names, fresh, again),
         )  # fmt: skip
     elif objects > 1 and not scene.turned:
         scene = _trained_on_base(

@@ -82,9 +82,7 @@ def trained_base(
     return folder / "run"
 
 
-def picked_scene(
-    scene: MadeScene, output: Path, base: Path, names: Sequence[str], fresh: bool, again: str
-) -> MadeScene:
+def picked_scene(scene: MadeScene, base: Path, names: Sequence[str], fresh: bool, again: str) -> MadeScene:
     """Return the scene with masks of the objects picked on its base; the viewer opens unless that was done before.
 
     names: of the expected objects. again: the command that continues. Raises ``UserError`` if nothing is saved.

@@ -167,7 +167,7 @@ def test_photos_of_a_turntable_are_trained_on_again_by_their_objects(tmp_path, m
     assert again() == []
 
 
-def test_a_demo_that_is_under_way_is_left_alone(tmp_path, monkeypatch):
+def test_a_demo_that_is_under_way_is_left_alone(tmp_path):
     from beags_plugin.system.lock import run_lock
 
     data, run = write_scene(tmp_path / "data"), tmp_path / "out/run"

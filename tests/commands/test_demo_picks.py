@@ -120,7 +120,7 @@ def test_things_that_lie_apart_are_told_apart_on_the_base_and_masks_of_them_that
     assert all(np.unique(read_id_mask(path)).tolist() == [8] for path in mended)
 
 
-def test_masks_that_nobody_made_here_hold_no_things_to_tell_apart(stand, tmp_path):
+def test_masks_that_nobody_made_here_hold_no_things_to_tell_apart(stand):
     write_image(stand.data / "masks/v01.png", np.full((60, 100), 1, np.uint8))
     with pytest.raises(UserError, match=r"are not a network's .* leave --objects out, or add --pick\."):
         stand.run(pick=False, objects=2)

@@ -227,7 +227,7 @@ def test_a_trained_scene_is_rendered_whole_cropped_and_by_object(trained):
     assert float(model.get_outputs_for_camera(camera, obb_box=box)["accumulation"].sum()) == 0.0
 
 
-def test_demo_on_a_folder_writes_table_figures_and_picture(trained, data, tmp_path, monkeypatch):
+def test_demo_on_a_folder_writes_table_figures_and_picture(trained, data, tmp_path):
     """The measuring half of the demo, on the run that is there."""
     from beags_plugin.commands.demo import measure
     from beags_plugin.commands.scene_setup import MadeScene

@@ -125,7 +125,7 @@ def test_the_camera_stands_upright_where_a_photo_was_taken(cup):
     assert len(means) == len(cup.surfels) and 0.7 < np.linalg.norm(means, axis=1).max() <= 1.0
 
 
-def test_the_page_holds_all_that_it_loads_and_a_name_is_only_a_name(tmp_path):
+def test_the_page_holds_all_that_it_loads_and_a_name_is_only_a_name():
     page = web_page('a "cup" </title><script>alert(1)</script>', b"123")
     assert "alert(1)</script>" not in page and "&lt;script&gt;alert(1)" in page
     outside = re.sub(r"<script.*?</script>|<style.*?</style>", "", page, flags=re.S)

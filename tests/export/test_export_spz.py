@@ -174,7 +174,7 @@ def test_positions_get_all_the_bits_there_are(reach, bits):
     assert round(reach * 2**bits) <= 2**23 - 1
 
 
-def test_mistakes(tmp_path):
+def test_mistakes():
     with pytest.raises(UserError, match=r"reaches 1e\+07 units from the origin"):
         fractional_bits(1e7)
     with pytest.raises(UserError, match="the version of .spz is 2"):

@@ -30,7 +30,7 @@ def read_image(path: Path | str, read: Callable[[Image], T], what: str = "the im
     """
     from PIL import Image, UnidentifiedImageError
 
-    def broken(why: str, error: Exception) -> UserError:
+    def broken(why: str) -> UserError:
         return UserError(f"{what} {path} cannot be read as an image ({why}): {remedy}.")
 
     try:
@@ -47,8 +47,8 @@ def read_image(path: Path | str, read: Callable[[Image], T], what: str = "the im
     except UnidentifiedImageError as error:
         if (cause := stand_in(path)) is not None:
             raise UserError(f"{what} {path} cannot be read: {cause}.") from error
-        raise broken(f"it is none of {', '.join(FORMATS)}", error) from error
+        raise broken(f"it is none of {', '.join(FORMATS)}") from error
     except Image.DecompressionBombError as error:
-        raise broken(f"it promises more than {MOST_PIXELS:,} pixels", error) from error
+        raise broken(f"it promises more than {MOST_PIXELS:,} pixels") from error
     except Exception as error:  # Pillow passes on all errors of the readers of single formats
-        raise broken(reason(error), error) from error
+        raise broken(reason(error)) from error

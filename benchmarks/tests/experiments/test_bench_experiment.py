@@ -133,7 +133,7 @@ def test_a_mistake_in_the_file_gets_one_sentence(tmp_path, old, new, words):
     assert "mine.toml" in str(error.value)
 
 
-def test_an_experiment_like_another_has_its_variants(tmp_path):
+def test_an_experiment_like_another_has_its_variants():
     other = load_experiment("compare")
     alike = load_experiment("compare-consistent")
     key = "pipeline.model.prepare.reprojection"

@@ -109,7 +109,7 @@ def test_more_damage_is_more_wrong_and_spares_held_out_views(sample, tmp_path):
     assert wrong == sorted(wrong) and wrong[0] < wrong[-1]
 
 
-def test_scenes_are_the_samples_or_the_users_or_both(sample, tmp_path, experiment, monkeypatch):
+def test_scenes_are_the_samples_or_the_users_or_both(sample, tmp_path, experiment):
     experiment = dataclasses.replace(experiment, sample=SMALL, samples=(("tabletop", 5), ("room", 5)))
     options = ExperimentOptions(output=tmp_path)
     assert [s.name for s in scenes_of(experiment, options)] == ["tabletop 5", "room 5"]

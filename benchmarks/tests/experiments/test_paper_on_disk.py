@@ -58,7 +58,7 @@ def test_a_complete_scene_is_ready(trees, name):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_photos_are_as_large_as_the_paper_has_them(trees, tmp_path, name, monkeypatch):
+def test_photos_are_as_large_as_the_paper_has_them(trees, tmp_path, name):
     shutil.copytree(trees / name, tmp_path / name)
     data_set = read_data_sets([name])[0]
     photo = next((tmp_path / name / SCENES[name] / data_set.images).iterdir())

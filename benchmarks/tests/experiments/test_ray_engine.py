@@ -199,7 +199,7 @@ def test_what_a_node_lacks_is_packed_once_and_its_folder_comes_back(run, tmp_pat
     assert fake.tasks[2][1].trained == ("parcel", 1), "it goes from node to node"
 
 
-def test_a_folder_that_does_not_fit_on_this_disk_is_a_reason(run, tmp_path, monkeypatch):
+def test_a_folder_that_does_not_fit_on_this_disk_is_a_reason(run, monkeypatch):
     def full(*_):
         raise UserError("t cannot be written (No space left on device): free some space.")
 

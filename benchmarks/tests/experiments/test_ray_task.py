@@ -165,7 +165,7 @@ def test_a_node_that_is_unfit_says_so(tmp_path, worker, task, monkeypatch):
     assert not list((tmp_path / "disk").glob("*/trials/t")) and len(worker.ran) == 1
 
 
-def test_a_node_without_room_for_what_it_is_sent_is_left_out(tmp_path, worker, task, monkeypatch):
+def test_a_node_without_room_for_what_it_is_sent_is_left_out(worker, task, monkeypatch):
     def full(*_):
         raise UserError("inputs cannot be written (No space left on device): free some space.")
 
@@ -184,7 +184,7 @@ def test_a_trial_that_fills_the_disk_of_its_node_leaves_it(tmp_path, worker, tas
     assert not list((tmp_path / "disk").glob("*/trials/t"))
 
 
-def test_a_trial_that_fills_the_shared_disk_is_named(tmp_path, worker, task, monkeypatch):
+def test_a_trial_that_fills_the_shared_disk_is_named(worker, task, monkeypatch):
     monkeypatch.setattr(trial_folder, "free_disk_mb", lambda _: 3.0)
     worker.code = 1
     outcome = perform(task(), "node", same)[0].outcome

@@ -73,7 +73,7 @@ def test_what_cannot_be_is_said(tmp_path, data, change, words):
     assert done.returncode == 1 and words in done.stderr
 
 
-def test_folders_and_options_are_checked_first(tmp_path, data):
+def test_folders_and_options_are_checked_first(tmp_path):
     done = called(tmp_path, "--data-root", str(tmp_path / "no"))
     assert done.returncode == 1 and "is no folder: name the one that holds fruit garden" in done.stderr
     done = subprocess.run(["bash", str(SCRIPT), "--fast"], capture_output=True, text=True, timeout=60)

@@ -254,7 +254,7 @@ def test_objects_that_turn_in_a_standing_light_are_no_exposures(folder):
     assert exposures_of_run(Model("on"), manager) is not None
 
 
-def test_what_is_see_through_tells_no_exposure(folder, monkeypatch):
+def test_what_is_see_through_tells_no_exposure(folder):
     manager = manager_of(folder(**EXPOSED))
     cached = manager.cached_train[2]
     cached["alpha"] = torch.zeros(cached["image"].shape[:2], dtype=torch.uint8)
