@@ -16,8 +16,8 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.pasted import command
 from beags_plugin.system.whole_files import write_text_atomically
 
-MADE = "made.json"  # Beside the masks: digests of the photos, and of the masks as they were made.
-UNFINISHED = "unfinished"  # In MADE while the masks are being made.
+MADE = "made.json"  # This file beside the masks holds digests of the photos, and of the masks as they were made.
+UNFINISHED = "unfinished"  # MADE says this while the masks are being made.
 
 
 @dataclass(frozen=True)

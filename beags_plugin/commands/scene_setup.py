@@ -24,7 +24,7 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
-MADE_OF = "made_of.json"  # In the scene: the path of its photos.
+MADE_OF = "made_of.json"  # This file in the scene holds the path of its photos.
 POSES = ("transforms*.json", "cameras.*", "*/cameras.*")  # Files that only a scene has, even an incomplete one.
 
 

@@ -12,7 +12,7 @@ from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import SH_C0, num_sh_bases
 from beags_plugin.core.surfels import Surfels, opacities
 
-# As the official code of 2DGS (Huang et al., SIGGRAPH 2024) has them; scales are relative to the scene's extent.
+# These values are those of the official code of 2DGS (Huang et al., SIGGRAPH 2024); scales are relative to the extent.
 GRADIENT_THRESHOLD = 2e-4  # mean screen gradient from which a surfel is cloned or split
 CLONE_SCALE = 0.01  # a larger surfel is split, a smaller one cloned
 SPLIT_SHRINK = 1.6  # both halves of a split surfel are this much smaller

@@ -127,7 +127,7 @@ def split_views(
     used = [index for index, own in enumerate(names) if own.isdisjoint(split.left_out)]
     out = set(used[::interval]) if split.every and interval > 0 else set()
     out |= {index for index in used if not names[index].isdisjoint(split.held_out)}
-    out |= {index for index, own in enumerate(names) if not own.isdisjoint(held_out)}  # also views left out
+    out |= {index for index, own in enumerate(names) if not own.isdisjoint(held_out)}  # Views left out count as well.
     train = [index for index in used if index not in out]
     if not train:
         raise UserError(f"all {len(used)} views are held out for evaluation: add views or change eval_interval.")

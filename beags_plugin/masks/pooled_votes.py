@@ -117,7 +117,7 @@ class TorchVotes:
         best = sums == most[point]
         leaders = zeros.scatter_add(0, point, best.long())
         winner = zeros.clone()
-        winner[point[best]] = label[best]  # not used in a tie
+        winner[point[best]] = label[best]  # A tie does not use it.
         share = most.float() / total.clamp(min=1).float()
         return torch.where(leaders == 1, winner.int(), labels), share
 

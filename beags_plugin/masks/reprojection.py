@@ -231,7 +231,7 @@ class _Votes:
         best = self.counts == most[pixel]
         leaders = zeros.scatter_add(0, pixel, best.int())
         winner = zeros.long()
-        winner[pixel[best]] = self.keys[best] % self.num_classes  # not used in a tie
+        winner[pixel[best]] = self.keys[best] % self.num_classes  # A tie does not use it.
         return winner, most, leaders, total
 
 

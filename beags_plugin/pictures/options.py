@@ -32,7 +32,7 @@ class RenderOptions:
     turn: float = 360.0
     """Degrees of the turn; less than 360 swings to and fro before the side that the photos show."""
     background: Background = "white"
-    """Behind the object: white, black, or checker."""
+    """What is behind the object: white, black, or checker."""
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that cannot be used."""

@@ -17,7 +17,7 @@ TRANSFORMS = "transforms.json"
 POINTS = "sparse_pc.ply"
 MODEL = Path("colmap/sparse/0")
 APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
-"""From COLMAP's world, whose first photo looks along z with y down, to nerfstudio's, where z is roughly up."""
+"""Turn from COLMAP's world, whose first photo looks along z with y down, to nerfstudio's, where z is roughly up."""
 _LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
 
 

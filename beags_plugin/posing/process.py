@@ -1,4 +1,4 @@
-"""From a folder of photos or a video to a scene with poses; a second call continues from saved results."""
+"""Turn a folder of photos or a video into a scene with poses; a second call continues from saved results."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ RASTERIZERS = Registry(
         "cuda": "beags_plugin.rasterizers.cuda:CudaRasterizer",
     },
 )
-_PREFERENCE = ("native", "torch")  # what "auto" tries, best first; on a GPU first "cuda"
+_PREFERENCE = ("native", "torch")  # backends that "auto" tries, best first; on a GPU "cuda" comes before them
 
 
 def make_rasterizer(name: str = "auto") -> Rasterizer:

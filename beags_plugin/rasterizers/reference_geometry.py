@@ -85,7 +85,7 @@ def _project(inputs: SurfelInputs, index: Tensor, camera: Camera) -> ProjectedSu
     axes = camera.rotation @ rotation_from_quat(inputs.quats[index])
     scales = inputs.log_scales[index].exp()
     a, b, n = scales[:, :1] * axes[:, :, 0], scales[:, 1:] * axes[:, :, 1], axes[:, :, 2]
-    n = torch.where((n * p).sum(dim=-1, keepdim=True) > 0, -n, n)  # towards the camera
+    n = torch.where((n * p).sum(dim=-1, keepdim=True) > 0, -n, n)  # normals that face the camera
     M = camera.K @ torch.stack([a, b, p], dim=-1)  # (E1)
     center = M[:, :2, 2] / M[:, 2:, 2]
     if inputs.screen_shift is not None:

@@ -13,7 +13,7 @@ from beags_plugin.sample.solids import dot
 FLAT = 0.77  # least cosine between the normals of faces whose common edge is smooth
 
 Measure = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""From surface points [N, 3] and unit normals [N, 3], in the mesh's frame, to their light [N, 3]."""
+"""Function of surface points [N, 3] and unit normals [N, 3], in the mesh's frame; returns their light [N, 3]."""
 
 
 class LightMap:

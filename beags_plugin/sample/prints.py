@@ -14,7 +14,7 @@ from beags_plugin.sample.textures import Noise
 
 Print = Callable[[np.ndarray, np.ndarray], np.ndarray]
 Paint = Callable[[np.ndarray], np.ndarray]
-"""From points [N, 3] in an object's frame to albedo [N, 3]."""
+"""Function of points [N, 3] in an object's frame; returns their albedo [N, 3]."""
 
 
 def _at(noise: Noise, u: np.ndarray, v: np.ndarray, layer: float = 0.0) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""From nerfstudio's normalised frame to the frame of the input data, and back."""
+"""Change between nerfstudio's normalised frame and the frame of the input data; read the transform of a run."""
 
 from __future__ import annotations
 

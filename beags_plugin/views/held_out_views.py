@@ -129,7 +129,7 @@ class HeldOutViews(Sequence[EvalView]):
         for class_id, file in self._files(files, view).items():
             ids = self._straight(file, read_object_mask(file, truth=True), view)
             masks[class_id] = torch.from_numpy(ids == 1)
-            if (unlabelled := ids == IGNORE).any():  # also pixels outside the lens
+            if (unlabelled := ids == IGNORE).any():  # Pixels outside the lens are among them.
                 unknown[class_id] = torch.from_numpy(unlabelled)
         return masks, unknown
 

@@ -28,7 +28,7 @@ BETAS, EPS = (0.9, 0.999), 1e-15  # Adam's.
 TOWARDS_START = 0.05  # Weight of the squared distance of a photo's transform from its start.
 OPAQUE = 242  # Least alpha, of 255, of a pixel that shows the scene.
 GAMMA, OFFSET = 2.4, 0.055
-"""Of sRGB's curve above its darkest values, (1 + OFFSET) light^(1 / GAMMA) - OFFSET; there a gain is an affine map."""
+"""sRGB's curve above its darkest values is (1 + OFFSET) light^(1 / GAMMA) - OFFSET; there a gain is an affine map."""
 
 
 class PhotoExposures:

@@ -128,7 +128,7 @@ def end_rendering(viewer: object) -> None:
     """
     threads = [
         thread
-        for thread in threading.enumerate()  # Also those whose page is closed already.
+        for thread in threading.enumerate()  # It knows threads of closed pages too.
         if isinstance(thread, RenderStateMachine) and thread.viewer is viewer
     ]
     for thread in threads:
