@@ -163,11 +163,21 @@ def _scene_of_objects(
 
 
 def _all_masks(photos: Path, labels: Path, name: str, chosen: ChosenSource, mended: Path | None) -> None:
-    """Make masks of all photos, because held-out ones need poses too; masks in ``mended`` replace them."""
+    """Make masks of all photos, because held-out ones need poses too; masks in ``mended`` replace them.
+
+    Masks of an earlier call are replaced by newer ones alone: the user may have mended either.
+    """
+
+    def digest() -> str:
+        return content_digest([path for path in [labels / MADE] if path.exists()])
+
+    before = digest()
     made_masks(photos, labels, name, chosen)
+    anew = digest() != before
     for mask in sorted(mended.glob("*.png")) if mended is not None else ():
         same = labels / "masks" / mask.name
-        if not same.exists() or same.read_bytes() != mask.read_bytes():
+        older = not anew and same.exists() and mask.stat().st_mtime_ns <= same.stat().st_mtime_ns
+        if not older and not (same.exists() and same.read_bytes() == mask.read_bytes()):
             shutil.copyfile(mask, same)
 
 

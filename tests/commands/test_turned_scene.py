@@ -84,10 +84,12 @@ def test_a_second_call_takes_mended_masks_and_forgets_photos_that_are_left_out(t
     wider = np.zeros((HEIGHT, WIDTH), np.uint8)
     wider[30:210, 70:250] = 1
     write_image(tmp_path / "out/scene/masks/v03.png", wider)
+    write_image(tmp_path / "out/turned/labels/masks/v04.png", wider)
     (tmp_path / "photos/v05.png").unlink()
     made = made_scene(tmp_path / "photos", tmp_path / "out")
     assert made.turned and made.labels is not None
-    assert (read_id_mask(made.labels / "masks/v03.png") == wider).all()
+    for mended in ("v03", "v04"):
+        assert (read_id_mask(made.labels / f"masks/{mended}.png") == wider).all()
     assert "v05" not in frames(made.data) and "v05" not in frames(tmp_path / "out/scene")
 
 
