@@ -154,11 +154,11 @@ class Make:
     data: Path
     """Folder of the scene."""
     source: str
-    """id-images, object-images, coco, gaussian-grouping, langsplat, cut, grabcut, salient, rembg, sam2, or your own."""
+    """id-images, object-images, coco, gaussian-grouping, langsplat, cut, salient, rembg, sam2, or your own."""
     options: tuple[str, ...] = ()
     """Options of the source, as key=value, e.g. prompts=prompts.json."""
     load_config: Path | None = None
-    """A run (folder or config.yml) trained on the scene, even of beags-base; for sources that need its depth."""
+    """A run (folder or config.yml) trained on the scene, even of beags-base; for sources that cut its scene."""
     output: Annotated[Path | None, OUTPUT] = None
     """Folder for masks/, classes.json and made.png; the scene's own if left out."""
     overwrite: bool = False

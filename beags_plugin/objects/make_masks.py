@@ -6,7 +6,6 @@ import json
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
-from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -27,7 +26,6 @@ from beags_plugin.objects.check_masks import check, options_beside, write_contra
 from beags_plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
 from beags_plugin.pictures.cells import below, cell, wrapped, write_picture
 from beags_plugin.pictures.masks import overlay
-from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
 from beags_plugin.runs.relocation import open_run
 from beags_plugin.runs.run import Run
 from beags_plugin.system.errors import UserError, check_choice, writing
@@ -55,10 +53,6 @@ class RunGeometry:
                 self.cameras.append(view.camera)
         self.rasterizer, self.settings = self.run.rasterizer, self.run.settings
 
-    @cached_property
-    def _surfels(self):
-        return geometry_inputs(self.run.scene.surfels())
-
     def surfels(self) -> Surfels:
         """Return the N Gaussians, in the run's frame."""
         return self.run.scene.surfels()
@@ -68,13 +62,6 @@ class RunGeometry:
         transform, scale = self.run.transform or (torch.eye(3, 4, dtype=torch.float64), 1.0)
         means = self.surfels().means.detach().double().cpu()
         return (means / scale - transform[:, 3]) @ transform[:, :3]  # double precision, as the world may lie far from 0
-
-    def depth(self, view: int) -> Tensor:
-        """Return the depth of the surface, [h, w] float32."""
-        kind = self.run.config.model_config.prepare.depth
-        with torch.no_grad():
-            render = self.rasterizer.rasterize(self._surfels, self.cameras[view], self.settings, torch.zeros(3))
-            return surface_depth(render, kind)
 
     def to_straight(self, labels: np.ndarray, view: int) -> np.ndarray:
         split, index = self._of_split[view]
@@ -126,9 +113,8 @@ def make_masks(
 ) -> list[str]:
     """Write the masks of a scene: <output>/masks/<stem>.png, classes.json and made.png, a picture of them.
 
-    The files replace the old masks of all views once all are made. Masks that are only to look at are written in the
-    same way to <output>/masks_to_look_at/, which nothing reads. data: names the scene. run: config.yml of a run trained
-    on it, for sources that need its depth. output: if None the scene's own folder, where ``beags-data`` looks for
+    The files replace the old masks of all views once all are made. data: names the scene. run: config.yml of a run
+    trained on it, for sources that need one. output: if None the scene's own folder, where ``beags-data`` looks for
     masks. overwrite: replace existing masks. snap: radius in pixels of ``masks.snapping.snap_to_edges``; 0 leaves
     outlines unchanged. upright: the source makes masks of the upright photos; they are turned to the photos as stored.
     Returns lines that report the written files and the findings of ``beags masks check``. Raises ``UserError``, before
@@ -136,8 +122,8 @@ def make_masks(
     """
     root, images, trained, posed = _photos(data, source)
     folder = output or root
-    masks, look_at, classes = folder / "masks", folder / "masks_to_look_at", folder / "classes.json"
-    there = [*masks.rglob("*.png"), *look_at.rglob("*.png"), *([classes] if classes.exists() else [])]
+    masks, classes = folder / "masks", folder / "classes.json"
+    there = [*masks.rglob("*.png"), *([classes] if classes.exists() else [])]
     if there and not overwrite:
         raise UserError(
             f"{folder} has masks or a classes.json already ({min(there).relative_to(folder)}): add --overwrite, or "
@@ -145,7 +131,7 @@ def make_masks(
         )
     if source.needs_run and run is None:
         raise UserError(
-            "this mask source needs the scene's depth: train beags-base, then add --load-config <run>/config.yml."
+            "this mask source needs a trained scene: train beags-base, then add --load-config <run>/config.yml."
         )
     sizes = [image_size(path) for path in images]
     photos = [
@@ -166,7 +152,7 @@ def make_masks(
         TemporaryDirectory(prefix=".masks_", dir=folder) as temporary,
         progress_bar("Making masks") as progress,
     ):
-        unfinished = {place: Path(temporary) / place.name for place in (masks, look_at)}
+        unfinished = Path(temporary) / masks.name
         made = source.make(SourceScene(root, photos, geometry), progress)
         check_names(made.names)
         for index, (path, labels) in enumerate(zip(mask_paths(images), made.maps, strict=True)):
@@ -175,14 +161,12 @@ def make_masks(
             if snap:
                 labels = snap_to_edges(labels, photos[index].pixels(), snap)
             labels = as_stored(labels, photos[index].turned)
-            place = look_at if index in made.to_look_at else masks
-            file = unfinished[place] / path
+            file = unfinished / path
             file.parent.mkdir(parents=True, exist_ok=True)
             write_mask(file, labels)
-            if place is masks:
-                shares.append(float((labels != 0).mean()))
+            shares.append(float((labels != 0).mean()))
             pictured.append(
-                (replace(photos[index], turned=1, width=labels.shape[1], height=labels.shape[0]), place / path)
+                (replace(photos[index], turned=1, width=labels.shape[1], height=labels.shape[0]), masks / path)
             )
         if not shares:
             raise UserError("the mask source gave no mask for any view: check its options.")
@@ -190,15 +174,13 @@ def make_masks(
             raise NothingFound(
                 "the mask source found no object in any view: name another source, or check its options."
             )
-        for place, new in unfinished.items():
-            _replace_masks(new, place, {image.stem for image in images})
+        _replace_masks(unfinished, masks, {image.stem for image in images})
         (masks / NO_TRUTH).unlink(missing_ok=True)
         if source.guesses and not posed:
             (masks / NO_TRUTH).write_text(json.dumps({"made by": type(source).__name__}))
     names = {str(i): name for i, name in sorted(made.names.items())}
     write_whole(classes, lambda file: file.write(json.dumps(names, indent=1).encode()))
     _picture(folder / "made.png", pictured)
-    aside = len(pictured) - len(shares)
     checked: list[str] = []
     with suppress(UserError):  # training reports other errors; photos without poses cannot be checked
         given = data if run is None else options_beside(run, data.data, images_path=data.images_path)
@@ -212,7 +194,6 @@ def make_masks(
         *made.notes,
         f"{len(shares)} masks of {len(photos)} views, {len(names) - 1} objects, which cover "
         f"{100 * np.mean(shares):.1f} % on average: {masks}",
-        *([f"{aside} masks of held-out views, only to look at: {look_at}"] if aside else []),
         f"names: {classes}; look at {folder / 'made.png'}",
         *checked,
     ]

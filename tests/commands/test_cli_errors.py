@@ -53,10 +53,10 @@ SENTENCES = {
     "masks check": "no scene is named: give --data its folder, or --load-config a run trained on it.",
     "masks check --data {tmp}/nowhere": NO_DATA,
     "masks check --load-config {tmp}/absent.yml": NO_FILE,
-    "masks make --data {tmp}/nowhere --source grabcut": NO_DATA,
+    "masks make --data {tmp}/nowhere --source cut": NO_DATA,
     "masks make --data {tmp}/lab --source magic": "there is no mask source 'magic': choose one of coco, cut, "
-    "gaussian-grouping, grabcut, id-images, langsplat, object-images, rembg, salient, sam2.",
-    "masks make --data {tmp}/lab --source grabcut --snap -1": "snap is -1: give a radius in pixels, or 0.",
+    "gaussian-grouping, id-images, langsplat, object-images, rembg, salient, sam2.",
+    "masks make --data {tmp}/lab --source cut --snap -1": "snap is -1: give a radius in pixels, or 0.",
     "masks make --data {tmp}/lab --source id-images": "{tmp}/lab has masks or a classes.json already "
     "(classes.json): add --overwrite, or give another --output.",
     "masks make --data {tmp}/lab --source id-images --options colour=red": "there is no option 'colour' of the mask "

@@ -32,20 +32,16 @@ def section(document: str, heading: str) -> str:
 
 
 class Reader:
-    """A user in a folder with a scene without masks, boxes for two views, and a scene to start from."""
+    """A user in a folder with a scene without masks, a point on each object in one photo, and a scene to start from."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.data = folder, folder / "my_scene"
         surfels = write_drawn_scene(self.data)
         objects = []
         for class_id, name in ((1, "cup"), (2, "box")):
-            prompts = []
-            for view in ("v01", "v04", "v06"):
-                row, column = (
-                    ids.tolist() for ids in np.nonzero(read_id_mask(self.data / f"masks/{view}.png") == class_id)
-                )
-                prompts.append({"view": view, "box": [min(column), min(row), max(column) + 1, max(row) + 1]})
-            objects.append({"name": name, "prompts": prompts})
+            row, column = np.nonzero(read_id_mask(self.data / "masks/v01.png") == class_id)
+            point = [int(np.median(column)), int(np.median(row))]
+            objects.append({"name": name, "prompts": [{"view": "v01", "points": [point]}]})
         (self.data / "prompts.json").write_text(json.dumps({"objects": objects}))
         shutil.rmtree(self.data / "masks")
         (self.data / "classes.json").unlink()
@@ -82,7 +78,7 @@ def reader(tmp_path_factory):
 @pytest.mark.parametrize(
     ("document", "heading", "programs"),
     [
-        ("masks.md", "GrabCut", ["ns-train", "beags", "beags", "ns-train"]),
+        ("masks.md", "Cut", ["ns-train", "beags", "ns-train"]),
         ("masks.md", "Reproject", ["beags", "ns-train"]),
         ("training.md", "Starting from a trained scene", ["ns-train"] * 3),
     ],

@@ -100,9 +100,8 @@ def test_masks_of_other_methods_are_trained_on(tmp_path, capsys):
 
 @dataclass(frozen=True)
 class Scripted(MaskSource):
-    """Masks of all views, empty but of ``shown``, those of ``aside`` only to look at; fails before ``breaks``."""
+    """Masks of all views, empty but of ``shown``; fails before ``breaks``."""
 
-    aside: tuple[int, ...] = ()
     shown: range = range(9)
     breaks: int = 99
 
@@ -113,7 +112,7 @@ class Scripted(MaskSource):
                     raise UserError("interrupted")
                 yield truth(0).astype(np.uint16) * np.uint16(index in self.shown)
 
-        return MadeMasks({0: "background", 1: "cup", 2: "box"}, maps(), [], frozenset(self.aside))
+        return MadeMasks({0: "background", 1: "cup", 2: "box"}, maps(), [])
 
 
 def test_objects_that_most_made_masks_lack_are_named(tmp_path):
@@ -133,25 +132,17 @@ def test_masks_are_made_of_data_that_training_would_refuse(tmp_path):
     assert (tmp_path / "masks/v01.png").exists() and (tmp_path / "classes.json").exists()
 
 
-def test_masks_to_look_at_are_guarded_and_whole_as_the_others(tmp_path):
+def test_masks_are_replaced_once_all_are_made(tmp_path):
     write_transforms(tmp_path)
     data = BeagsDataParserConfig(data=tmp_path)
-    lines = " ".join(make_masks(data, Scripted(aside=(0, 8))))
-    assert "7 masks of 9 views, 2 objects" in lines and "2 masks of held-out views, only to look at" in lines
-    aside = tmp_path / "masks_to_look_at"
-    assert sorted(path.name for path in aside.iterdir()) == ["v00.png", "v08.png"]
-    for path in (*(tmp_path / "masks").iterdir(), tmp_path / "classes.json"):
-        path.unlink()
-    with pytest.raises(UserError, match=r"already \(masks_to_look_at/v00.png\): add --overwrite"):
+    assert "9 masks of 9 views, 2 objects" in " ".join(make_masks(data, Scripted()))
+    (tmp_path / "classes.json").unlink()
+    with pytest.raises(UserError, match=r"already \(masks/v00.png\): add --overwrite"):
         make_masks(data, Scripted())
-    kept = {path: path.read_bytes() for path in aside.iterdir()}
+    kept = {path: path.read_bytes() for path in (tmp_path / "masks").iterdir()}
     with pytest.raises(UserError, match="interrupted"):
-        make_masks(data, Scripted(aside=(0, 1), breaks=4), overwrite=True)
-    assert {path: path.read_bytes() for path in aside.iterdir()} == kept and not list((tmp_path / "masks").iterdir())
-    make_masks(data, Scripted(), overwrite=True)
-    assert not list(aside.iterdir()) and len(list((tmp_path / "masks").iterdir())) == 9  # none of a former run stays
-    with pytest.raises(UserError, match="gave no mask"):
-        make_masks(data, Scripted(aside=tuple(range(9))), overwrite=True)
+        make_masks(data, Scripted(breaks=4, shown=range(2)), overwrite=True)
+    assert {path: path.read_bytes() for path in (tmp_path / "masks").iterdir()} == kept
 
 
 @pytest.mark.parametrize("lens", [{}, {"k1": -0.12, "k2": 0.02}])
@@ -211,8 +202,6 @@ def test_the_geometry_of_a_run_has_its_held_out_views_too(tmp_path):
     assert [path.stem for path in geometry.images] == [f"v{index:02d}" for index in (*range(1, 8), 0, 8)]
     ids = truth(0)
     for view in (0, 7, 8):
-        camera = geometry.cameras[view]
-        assert tuple(geometry.depth(view).shape) == (camera.height, camera.width)
         straight = geometry.to_straight(ids.astype(np.uint16), view)
         np.testing.assert_array_equal(geometry.to_photo(straight, view), ids)  # this scene has no lens distortion
 

@@ -44,9 +44,6 @@ class Solids:
     def input_means(self):
         return self._surfels.means.double() / 2
 
-    def depth(self, view: int):
-        raise AssertionError("the cut needs no depth")
-
     def to_straight(self, labels: np.ndarray, view: int) -> np.ndarray:
         return labels
 
@@ -207,4 +204,10 @@ def test_bad_prompts_end_with_a_sentence(name, run, tmp_path):
 def test_a_held_out_view_is_not_prompted(run, tmp_path):
     photos = [replace(photo, trained=index != 3) for index, photo in enumerate(run.photos)]
     with pytest.raises(UserError, match="prompts in v3, which is held out"):
+        make(CutSource(), scene_with(run, tmp_path, [low(run)], photos))
+
+
+def test_a_run_of_other_photos_is_refused(run, tmp_path):
+    photos = [replace(photo, path=tmp_path / photo.path.name) for photo in run.photos]
+    with pytest.raises(UserError, match="was trained on .*, which is no image of"):
         make(CutSource(), scene_with(run, tmp_path, [low(run)], photos))

@@ -24,7 +24,7 @@ from beags_plugin.system.errors import UserError
 
 def test_every_source_can_be_named_without_its_library():
     assert set(MASK_SOURCES.names()) >= {
-        "coco", "gaussian-grouping", "grabcut", "id-images", "langsplat", "object-images", "salient",
+        "coco", "gaussian-grouping", "id-images", "langsplat", "object-images", "salient",
         "sam2",
     }  # fmt: skip
     for name in MASK_SOURCES.names():

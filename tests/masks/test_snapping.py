@@ -2,12 +2,15 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
+from source_scenes import coloured
 
 cv2 = pytest.importorskip("cv2")
 
 from beags_plugin.labels.class_ids import IGNORE  # noqa: E402
 from beags_plugin.masks import snapping  # noqa: E402
 from beags_plugin.masks.snapping import snap_to_edges  # noqa: E402
+from beags_plugin.system.errors import UserError  # noqa: E402
 
 HEIGHT, WIDTH = 90, 120
 
@@ -81,3 +84,28 @@ def test_the_labels_are_the_same_for_any_number_of_threads():
         cv2.setNumThreads(before)
     for other in found[1:]:
         np.testing.assert_array_equal(found[0], other)
+
+
+def test_outlines_snap_to_the_edge_of_the_photo():
+    photo, disc = coloured()
+    exact = disc.astype(np.uint16)
+    ragged = exact.copy()
+    row, column = np.mgrid[:70, :90]
+    bumps = (row // 4 + column // 4) % 2 == 0
+    ragged[ndimage.binary_dilation(disc, iterations=2) & bumps] = 1
+    ragged[0, 0] = IGNORE
+    snapped = snap_to_edges(ragged, photo, 4)
+    assert snapped[0, 0] == IGNORE
+    snapped[0, 0] = 0
+    assert (snapped != exact).sum() < 0.4 * (ragged != exact).sum()
+    far = ndimage.distance_transform_edt(~(ndimage.binary_dilation(disc, iterations=3) & ~ndimage.binary_erosion(disc)))
+    assert not ((snapped != ragged) & (far > 8))[5:].any()
+    np.testing.assert_array_equal(snap_to_edges(ragged, photo, 0), ragged)
+
+
+def test_plain_opencv_has_no_guided_filter(monkeypatch):
+    monkeypatch.setattr(cv2, "ximgproc", type("shell", (), {}))  # what plain opencv installed over contrib leaves
+    labels = np.zeros((8, 9), np.uint16)
+    labels[2:5] = 1
+    with pytest.raises(UserError, match="run beags doctor"):
+        snap_to_edges(labels, np.zeros((8, 9, 3), np.uint8), 2)

@@ -131,23 +131,19 @@ def langsplat(segments: Any, features: Any) -> Callable[[Path], Any]:
     return write
 
 
-def grabcut(content: Any) -> Callable[[Place], Any]:
-    """Return a mistake in the prompts of GrabCut, which asks a run for its depth. content: text, or an object."""
+def prompts(content: Any) -> Callable[[Place], Any]:
+    """Return a mistake in the prompts of the cut, which asks a run for its Gaussians. content: text, or an object."""
     text = content if isinstance(content, str) else json.dumps({"objects": [content]})
-    return made("grabcut", file("prompts.json", text), "--options prompts=prompts.json --load-config {run}")
-
-
-def cut(**places: Any) -> Callable[[Place], Any]:
-    """Return a mistake in the prompts of the cut, which asks a run for its Gaussians. places: of a cup, in view v01."""
-    text = json.dumps({"objects": [{"name": "cup", "prompts": [{"view": "v01", **places}]}]})
     return made("cut", file("prompts.json", text), "--options prompts=prompts.json --load-config {run}")
 
 
-def boxed(box: list[Any], view: str = "v01") -> dict[str, Any]:
-    return {"name": "cup", "prompts": [{"view": view, "box": box}]}
+def cut(**places: Any) -> Callable[[Place], Any]:
+    """Return a mistake in the prompts of a cup, of which view v01 has these places."""
+    return prompts({"name": "cup", "prompts": [{"view": "v01", **places}]})
 
 
-GOOD = file("prompts.json", json.dumps({"objects": [boxed([2, 2, 8, 8])]}))
+CUP = {"name": "cup", "prompts": [{"view": "v01", "points": [[5, 5]]}]}
+GOOD = file("prompts.json", json.dumps({"objects": [CUP]}))
 FEATURES = np.ones((1, 3))
 OTHER_PHOTO = [{"id": 1, "file_name": "other.png"}]
 mistakes(
@@ -169,18 +165,17 @@ mistakes(
         "LangSplat: an array cut off": made("langsplat", langsplat(b"\x93NUMPY\x01", FEATURES)),
         "LangSplat: segments of wrong shape": made("langsplat", langsplat(np.ones(3), FEATURES)),
         "LangSplat: segments without features": made("langsplat", langsplat(np.full((4, HEIGHT, WIDTH), 5), FEATURES)),
-        "GrabCut: no prompts": made("grabcut", options="--options prompts=prompts.json --load-config {run}"),
-        "GrabCut: a box outside of the picture": grabcut(boxed([100, 100, 200, 200])),
-        "GrabCut: a box turned around": grabcut(boxed([8, 8, 2, 2])),
-        "GrabCut: a view that does not exist": grabcut(boxed([2, 2, 8, 8], "v99")),
-        "GrabCut: prompts broken": grabcut("{"),
-        "GrabCut: prompts nested 100,000 deep": grabcut("[" * 100_000),
+        "the cut: no prompts": made("cut", options="--options prompts=prompts.json --load-config {run}"),
+        "the cut: a box outside of the picture": cut(points=[[5, 5]], box=[100, 100, 200, 200]),
+        "the cut: a box turned around": cut(box=[8, 8, 2, 2]),
+        "the cut: prompts broken": prompts("{"),
+        "the cut: prompts nested 100,000 deep": prompts("[" * 100_000),
         "the cut: no point on the object": cut(box=[2, 2, 8, 8]),
         "the cut: a point outside of the picture": cut(points=[[100, 100]]),
         "the cut: a view that does not exist": cut(view="v99", points=[[5, 5]]),
         "the cut: points that contradict": cut(points=[[6, 6]], outside=[[6, 6]]),
         "the cut: a point on nothing": cut(points=[[0, 11]]),
-        "depth of a run without the run": made("grabcut", GOOD, "--options prompts=prompts.json"),
+        "the cut without a run": made("cut", GOOD, "--options prompts=prompts.json"),
     },
 )
 

@@ -1,15 +1,13 @@
-"""Scenes for mask sources: photos, the maps that are to come of them, and a wall seen from three places."""
+"""Scenes for mask sources: photos, and the maps that are to come of them."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-import torch
 from data_folders import HEIGHT, WIDTH, write_image
 from PIL import Image
 
-from beags_plugin.core.cameras import Camera
 from beags_plugin.masks.sources.base import MadeMasks, Photo, SourceScene
 
 
@@ -63,32 +61,3 @@ def coloured(width: int = 90, height: int = 70, left: int = 30) -> tuple[np.ndar
     disc = (row - 35) ** 2 + (column - left) ** 2 < 15**2
     photo = np.where(disc[..., None], (190, 50, 40), (110, 120, 115)) + generator.integers(-12, 12, (height, width, 3))
     return photo.astype(np.uint8), disc
-
-
-class Wall:
-    """Three cameras side by side before a wall at depth 2: what one sees at x another sees ``shift`` pixels farther."""
-
-    def __init__(self, root: Path, known: int = 3) -> None:
-        self.photos, self.discs = [], []
-        for index in range(3):
-            photo, disc = coloured(left=30 + 10 * index)
-            path = root / f"images/v{index}.png"
-            write_image(path, photo)
-            self.photos.append(Photo(path.stem, path, 90, 70))
-            self.discs.append(disc)
-        self.images = [photo.path for photo in self.photos[:known]]
-        K = torch.tensor([[100.0, 0, 45], [0, 100.0, 35], [0, 0, 1]])
-        self.cameras = []
-        for index in range(known):
-            viewmat = torch.eye(4)
-            viewmat[0, 3] = 0.2 * index  # 10 pixels at depth 2
-            self.cameras.append(Camera(viewmat, K, 90, 70))
-
-    def depth(self, view: int) -> torch.Tensor:
-        return torch.full((70, 90), 2.0)
-
-    def to_straight(self, class_map: np.ndarray, view: int) -> np.ndarray:
-        return class_map
-
-    def to_photo(self, class_map: np.ndarray, view: int) -> np.ndarray:
-        return class_map

@@ -9,7 +9,6 @@ MASK_SOURCES = Registry(
         "coco": "beags_plugin.masks.sources.coco:CocoSource",
         "cut": "beags_plugin.masks.sources.cut:CutSource",
         "gaussian-grouping": "beags_plugin.masks.sources.id_images:GaussianGroupingSource",
-        "grabcut": "beags_plugin.masks.sources.grabcut:GrabCutSource",
         "id-images": "beags_plugin.masks.sources.id_images:IdImagesSource",
         "langsplat": "beags_plugin.masks.sources.langsplat:LangSplatSource",
         "object-images": "beags_plugin.masks.sources.object_images:ObjectImagesSource",

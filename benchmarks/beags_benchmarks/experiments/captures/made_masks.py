@@ -50,11 +50,10 @@ def masked_scene(found: FoundCapture, kind: str, base: Trial, output: Path) -> T
 
 def masks_folder(found: FoundCapture, kind: str, base: Trial, output: Path) -> Path | None:
     """Return the folder of made masks, whose name has a digest of all inputs; None for the capture's own masks."""
-    from beags_plugin.masks.sources import grabcut, salient
+    from beags_plugin.masks.sources import salient
 
     if kind == SALIENT:
-        code = [Path(str(module.__file__)).read_text("utf8") for module in (salient, grabcut)]
-        made_of = [found.photos.digest, code]
+        made_of = [found.photos.digest, Path(str(salient.__file__)).read_text("utf8")]
     elif kind == PICKED:
         made_of = [base.digest, found.capture.prompts.read_text("utf8")]
     else:
