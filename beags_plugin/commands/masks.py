@@ -154,7 +154,7 @@ class Make:
     data: Path
     """Folder of the scene."""
     source: str
-    """id-images, object-images, coco, gaussian-grouping, langsplat, cut, salient, rembg, sam2, or your own."""
+    """id-images, object-images, coco, gaussian-grouping, cut, salient, rembg, sam2, or your own."""
     options: tuple[str, ...] = ()
     """Options of the source, as key=value, e.g. prompts=prompts.json."""
     load_config: Path | None = None

@@ -55,7 +55,7 @@ SENTENCES = {
     "masks check --load-config {tmp}/absent.yml": NO_FILE,
     "masks make --data {tmp}/nowhere --source cut": NO_DATA,
     "masks make --data {tmp}/lab --source magic": "there is no mask source 'magic': choose one of coco, cut, "
-    "gaussian-grouping, id-images, langsplat, object-images, rembg, salient, sam2.",
+    "gaussian-grouping, id-images, object-images, rembg, salient, sam2.",
     "masks make --data {tmp}/lab --source cut --snap -1": "snap is -1: give a radius in pixels, or 0.",
     "masks make --data {tmp}/lab --source id-images": "{tmp}/lab has masks or a classes.json already "
     "(classes.json): add --overwrite, or give another --output.",

@@ -66,36 +66,26 @@ def test_photos_without_poses_get_masks_for_the_search_of_poses(tmp_path, capsys
         np.testing.assert_array_equal(read_id_mask(tmp_path / f"masks/v{index}.png"), truth(0) == 1)
 
 
-def test_masks_of_other_methods_are_trained_on(tmp_path, capsys):
-    """Gaussian Grouping's ids and LangSplat's segments, from their files to what the data parser reads of them."""
+def test_masks_of_gaussian_grouping_are_trained_on(tmp_path, capsys):
+    """From the files of ids to what the data parser reads of them."""
     write_colmap(tmp_path)
-    own, features = np.array([0, 37, 112], np.uint8), np.eye(6)
-    (tmp_path / "language_features").mkdir()
+    own = np.array([0, 37, 112], np.uint8)
     for index in range(9):
         ids = own[truth(index % 4)]
         ids[11, 0] = 200 if index < 2 else 0
         write_image(tmp_path / f"object_mask/v{index:02d}.png", ids)
-        segments = np.full((4, HEIGHT, WIDTH), -1)
-        segments[3] = (truth(index % 4) + index) % 3  # numbered anew in each view
-        np.save(tmp_path / f"language_features/v{index:02d}_s.npy", segments)
-        np.save(tmp_path / f"language_features/v{index:02d}_f.npy", features[(np.arange(3) - index) % 3])
-    for source in ("gaussian-grouping", "langsplat"):
-        folder = tmp_path / "made" / source
-        main(["masks", "make", "--data", str(tmp_path), "--source", source, "--output", str(folder)])
-        out = capsys.readouterr().out
-        assert "9 masks of 9 views" in out and ("1 ids in fewer than 3 views" in out) == (source[0] == "g")
-        parser = BeagsDataParserConfig(
-            data=tmp_path, masks_path=folder / "masks", classes_path=folder / "classes.json"
-        )  # fmt: skip
-        metadata = parser.setup().get_dataparser_outputs("train").metadata
-        count = 3 if source[0] == "g" else 4  # LangSplat has a segment for the background too
-        assert len(metadata["classes"]) == count and len(metadata["mask_filenames"]) == 7
-        pairs = set()
-        for path in metadata["mask_filenames"]:
-            exact = truth(int(path.stem[1:]) % 4)
-            pairs |= set(zip(read_id_mask(path).ravel().tolist(), exact.ravel().tolist(), strict=True))
-        assert len(pairs) == 3  # an id for each object, the same in all views
-        assert source[0] == "l" or pairs == {(0, 0), (37, 1), (112, 2)}
+    folder = tmp_path / "made"
+    main(["masks", "make", "--data", str(tmp_path), "--source", "gaussian-grouping", "--output", str(folder)])
+    out = capsys.readouterr().out
+    assert "9 masks of 9 views" in out and "1 ids in fewer than 3 views" in out
+    config = BeagsDataParserConfig(data=tmp_path, masks_path=folder / "masks", classes_path=folder / "classes.json")
+    metadata = config.setup().get_dataparser_outputs("train").metadata
+    assert len(metadata["classes"]) == 3 and len(metadata["mask_filenames"]) == 7
+    pairs = set()
+    for path in metadata["mask_filenames"]:
+        exact = truth(int(path.stem[1:]) % 4)
+        pairs |= set(zip(read_id_mask(path).ravel().tolist(), exact.ravel().tolist(), strict=True))
+    assert pairs == {(0, 0), (37, 1), (112, 2)}
 
 
 @dataclass(frozen=True)

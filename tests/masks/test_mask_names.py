@@ -5,18 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
-from data_folders import HEIGHT, WIDTH, write_transforms
+from data_folders import write_transforms
 from source_scenes import make, mask_at, scene_of, scene_of_folders, values_of
 
 from beags_plugin.commands.cli import main
 from beags_plugin.data.files import photo_names
-from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.masks.sources.coco import CocoSource
 from beags_plugin.masks.sources.id_images import IdImagesSource
-from beags_plugin.masks.sources.langsplat import LangSplatSource
 from beags_plugin.masks.sources.matching import PhotoNames
 from beags_plugin.masks.sources.object_images import ObjectImagesSource
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
@@ -101,7 +98,7 @@ def test_two_files_of_one_name_are_refused(tmp_path):
         photo_names([pair[0], pair[0]])
 
 
-def test_objects_and_coco_and_features_are_matched_by_folders_too(tmp_path):
+def test_objects_and_coco_are_matched_by_folders_too(tmp_path):
     scene = scene_of_folders(tmp_path)
     for way, pattern in (("first", "cup/{}.png"), ("last", "{}/cup.png")):
         for value, name in ((0, "left/v0"), (255, "right/v0")):
@@ -116,13 +113,6 @@ def test_objects_and_coco_and_features_are_matched_by_folders_too(tmp_path):
     (tmp_path / "annotations.json").write_text(json.dumps({"images": images, "annotations": annotations}))
     with pytest.raises(UserError, match="the image v0.jpg of .*annotations.json could belong to left/v0 or right/v0"):
         make(CocoSource(), scene)
-    for segment, name in ((0, "left/v0"), (-1, "right/v0")):
-        path = tmp_path / f"language_features/{name}_s.npy"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.save(path, np.full((4, HEIGHT, WIDTH), segment))
-        np.save(path.with_name("v0_f.npy"), np.ones((1, 3)))
-    maps = make(LangSplatSource(least_views=1), scene)[1]
-    assert values_of(maps) == [1, None, IGNORE, None]
 
 
 def test_prompts_name_views_by_folders(tmp_path):

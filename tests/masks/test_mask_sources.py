@@ -16,7 +16,6 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.masks.sources import MASK_SOURCES
 from beags_plugin.masks.sources.coco import CocoSource, decoded
 from beags_plugin.masks.sources.id_images import GaussianGroupingSource, IdImagesSource
-from beags_plugin.masks.sources.langsplat import LangSplatSource
 from beags_plugin.masks.sources.object_images import ObjectImagesSource
 from beags_plugin.masks.sources.prompts import Prompt, read_prompts
 from beags_plugin.system.errors import UserError
@@ -24,7 +23,7 @@ from beags_plugin.system.errors import UserError
 
 def test_every_source_can_be_named_without_its_library():
     assert set(MASK_SOURCES.names()) >= {
-        "coco", "gaussian-grouping", "id-images", "langsplat", "object-images", "salient",
+        "coco", "gaussian-grouping", "id-images", "object-images", "salient",
         "sam2",
     }  # fmt: skip
     for name in MASK_SOURCES.names():
@@ -153,31 +152,6 @@ def test_coco_run_lengths_polygons_and_instances(tmp_path):
     ):
         with pytest.raises(UserError, match=message):
             decoded(wrong, (HEIGHT, WIDTH), "file")
-
-
-def test_langsplat_segments_are_matched_by_features(tmp_path):
-    scene = scene_of(tmp_path)
-    generator = np.random.default_rng(0)
-    features = np.eye(8)[:3]
-    for index in range(3):
-        order = generator.permutation(3)  # segments are numbered anew in each view
-        maps = np.full((4, HEIGHT, WIDTH), -1)
-        for exact in (1, 2):
-            maps[3][truth(index) == exact] = int(np.flatnonzero(order == exact)[0])
-        rows = features[order] + 0.02 * generator.normal(size=(3, 8))
-        (tmp_path / "language_features").mkdir(exist_ok=True)
-        np.save(tmp_path / f"language_features/v{index}_s.npy", maps)
-        np.save(tmp_path / f"language_features/v{index}_f.npy", rows)
-    names, maps = make(LangSplatSource(), scene)
-    assert len(names) == 3 and maps[3] is None
-    pairs = {p for i in range(3) for p in zip(maps[i].ravel().tolist(), truth(i).ravel().tolist(), strict=True)}
-    assert len(pairs) == 3 and (IGNORE, 0) in pairs
-    (tmp_path / "language_features/v1_f.npy").write_bytes(b"no array")
-    with pytest.raises(UserError, match="v1_f.npy cannot be read as an array"):
-        make(LangSplatSource(), scene)
-    (tmp_path / "language_features/v1_f.npy").unlink()
-    with pytest.raises(UserError, match="segments of two views cannot be matched"):
-        make(LangSplatSource(), scene)
 
 
 def test_prompts_are_read_and_mistakes_refused(tmp_path):

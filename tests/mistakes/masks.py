@@ -118,19 +118,6 @@ def file(name: str, text: str) -> Callable[[Path], Any]:
     return lambda data: (data / name).write_text(text)
 
 
-def langsplat(segments: Any, features: Any) -> Callable[[Path], Any]:
-    def write(data: Path) -> None:
-        folder = data / "language_features"
-        folder.mkdir()
-        for name, array in (("v01_s.npy", segments), ("v01_f.npy", features)):
-            if isinstance(array, bytes):
-                (folder / name).write_bytes(array)
-            else:
-                np.save(folder / name, array)
-
-    return write
-
-
 def prompts(content: Any) -> Callable[[Place], Any]:
     """Return a mistake in the prompts of the cut, which asks a run for its Gaussians. content: text, or an object."""
     text = content if isinstance(content, str) else json.dumps({"objects": [content]})
@@ -144,13 +131,12 @@ def cut(**places: Any) -> Callable[[Place], Any]:
 
 CUP = {"name": "cup", "prompts": [{"view": "v01", "points": [[5, 5]]}]}
 GOOD = file("prompts.json", json.dumps({"objects": [CUP]}))
-FEATURES = np.ones((1, 3))
 OTHER_PHOTO = [{"id": 1, "file_name": "other.png"}]
 mistakes(
     "mask sources",
     {
         "an unknown option": made("coco", options="--options color=red"),
-        "a wrong value of an option": made("langsplat", options="--options similarity=much"),
+        "a wrong value of an option": made("id-images", options="--options least_views=much"),
         "COCO: no such file": made("coco"),
         "COCO: broken": made("coco", file("annotations.json", "{")),
         "COCO: no annotations": made("coco", file("annotations.json", '{"images": []}')),
@@ -160,11 +146,6 @@ mistakes(
         "a folder without masks": made("id-images", options="--options folder=nowhere"),
         "Gaussian Grouping without its folder": made("gaussian-grouping"),
         "images of objects missing": made("object-images"),
-        "LangSplat without its folder": made("langsplat"),
-        "LangSplat: pickled objects": made("langsplat", langsplat(np.array([{}], dtype=object), FEATURES)),
-        "LangSplat: an array cut off": made("langsplat", langsplat(b"\x93NUMPY\x01", FEATURES)),
-        "LangSplat: segments of wrong shape": made("langsplat", langsplat(np.ones(3), FEATURES)),
-        "LangSplat: segments without features": made("langsplat", langsplat(np.full((4, HEIGHT, WIDTH), 5), FEATURES)),
         "the cut: no prompts": made("cut", options="--options prompts=prompts.json --load-config {run}"),
         "the cut: a box outside of the picture": cut(points=[[5, 5]], box=[100, 100, 200, 200]),
         "the cut: a box turned around": cut(box=[8, 8, 2, 2]),

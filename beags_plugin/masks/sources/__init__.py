@@ -10,7 +10,6 @@ MASK_SOURCES = Registry(
         "cut": "beags_plugin.masks.sources.cut:CutSource",
         "gaussian-grouping": "beags_plugin.masks.sources.id_images:GaussianGroupingSource",
         "id-images": "beags_plugin.masks.sources.id_images:IdImagesSource",
-        "langsplat": "beags_plugin.masks.sources.langsplat:LangSplatSource",
         "object-images": "beags_plugin.masks.sources.object_images:ObjectImagesSource",
         "rembg": "beags_plugin.masks.sources.rembg:RembgSource",
         "salient": "beags_plugin.masks.sources.salient:SalientSource",

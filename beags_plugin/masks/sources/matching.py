@@ -108,14 +108,14 @@ def plain(name: str) -> str:
     return (path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path).as_posix()
 
 
-def files_by_name(folder: Path, endings: Sequence[str] = IMAGE_SUFFIXES) -> dict[str, Path]:
-    """Find the files below a folder with these endings, by their paths without the ending.
+def files_by_name(folder: Path) -> dict[str, Path]:
+    """Find the images below a folder, by their paths without the suffix.
 
-    Raises ``UserError`` if two differ only in the ending.
+    Raises ``UserError`` if two differ only in the suffix.
     """
     files: dict[str, Path] = {}
     for path in sorted(folder.rglob("*")):
-        ending = next((end for end in endings if path.name.lower().endswith(end)), None)
+        ending = next((end for end in IMAGE_SUFFIXES if path.name.lower().endswith(end)), None)
         if ending is not None and path.is_file():
             name = path.relative_to(folder).as_posix()[: -len(ending)]
             if name in files:
