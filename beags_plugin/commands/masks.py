@@ -37,8 +37,6 @@ class Check:
     """File {"id": "name"} of the classes; as in the run, else classes.json."""
     ignore_ids: tuple[int, ...] | None = None
     """Ids in the masks that mean "not labelled", if not the run's own."""
-    min_views: int = 3
-    """An object in fewer training views is reported."""
     output: Annotated[Path | None, OUTPUT] = None
     """Folder for report.json, coverage.png and contradicted.png; outputs/masks_check/<scene's name> if left out."""
 
@@ -49,7 +47,7 @@ class Check:
             from beags_plugin.objects.check_masks import check, options_beside, write_report
         names = ("layout", "images_path", "masks_path", "classes_path", "ignore_ids")
         parser = options_beside(self.load_config, self.data, **{name: getattr(self, name) for name in names})
-        report = check(parser, self.min_views, self.load_config)
+        report = check(parser, self.load_config)
         for line in report.lines():
             CONSOLE.print(line)
         for path in write_report(report, self.output or Path("outputs/masks_check") / report.data.name):
@@ -71,7 +69,7 @@ class Check:
 
 @dataclass
 class Reproject:
-    """Let all views vote on each other's masks, with the depth of a trained run; write the result."""
+    """Let all views vote on each other's masks, as the run is configured, with its depth; write the result."""
 
     load_config: Path
     """Any trained run, even of beags-base: its folder, or config.yml in it."""
@@ -79,13 +77,6 @@ class Reproject:
     """Folder of the id images, if not those that the run was trained on."""
     classes_path: Path | None = None
     """File {"id": "name"} for them; classes.json beside the folder if there is one."""
-    method: str | None = None
-    """pairwise (exact), voxel (quick), auto (the one that fits the views) or your own; as the run is configured
-    if left out."""
-    tau: float | None = None
-    """pairwise: a vote counts if |z - depth| <= tau z; inf counts all."""
-    depth: str | None = None
-    """Which depth is lifted: median or expected."""
     min_confidence: float = 0.0
     """Pixels whose winner has a smaller share of the votes are written as unlabelled (65535)."""
     run_size: bool = False
@@ -104,9 +95,7 @@ class Reproject:
                 reproject_run,
                 write_reprojection,
             )
-        options = ReprojectionOptions(
-            self.masks_path, self.classes_path, self.method, self.tau, self.depth, self.run_size, data=self.data
-        )
+        options = ReprojectionOptions(self.masks_path, self.classes_path, run_size=self.run_size, data=self.data)
         masks = reproject_run(self.load_config, options)
         output = self.output or self.load_config.parent / "reprojected"
         for line in write_reprojection(masks, output, self.min_confidence):

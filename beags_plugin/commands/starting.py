@@ -16,7 +16,6 @@ from rich.console import Console
 
 from beags_plugin.data import LAYOUTS
 from beags_plugin.export import EXPORTERS
-from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.masks.sources import MASK_SOURCES
 from beags_plugin.options.run_format import CONFIG_FILE
 from beags_plugin.pictures.options import PictureFormat, RenderOptions
@@ -50,8 +49,6 @@ def check_arguments(command: Any) -> None:
         raise UserError(f"the data folder {data} does not exist: give --data the folder that holds the scene.")
     if (preset := values.get("preset")) is not None:
         check_choice(preset, shipped_names("method_configs"), "preset")
-    if (method := values.get("method")) not in (None, "auto", "none"):
-        REPROJECTIONS.check(method, "auto", "none")
     if (layout := values.get("layout")) not in (None, "auto"):
         LAYOUTS.check(layout, "auto")
     if (source := values.get("source")) is not None:

@@ -24,13 +24,13 @@ from beags_plugin.masks.check.contradictions import (
     settle,
 )
 from beags_plugin.masks.check.disagreement import views_against_others
-from beags_plugin.masks.check.files import FEW_VIEWS, MOST_IDS, Coverage, MaskFiles, check_files
+from beags_plugin.masks.check.files import MOST_IDS, Coverage, MaskFiles, check_files
 from beags_plugin.masks.check.issues import LEVELS, Issue, ordered, percent
 from beags_plugin.objects.compare_views import agreements, pointed, points_in_space, tracks_of, turned
 from beags_plugin.objects.reproject_masks import ReprojectedRun, ReprojectionOptions, reproject_run
 from beags_plugin.pictures.masks import Changed, Pointed, contradicted_picture, coverage_picture
 from beags_plugin.runs.relocation import open_run
-from beags_plugin.system.errors import UserError, writing
+from beags_plugin.system.errors import writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.views.data_options import DataOptions
 from beags_plugin.views.poses import PosedViews
@@ -122,26 +122,24 @@ class Report:
         }
 
 
-def check(parser: DataOptions, few_views: int = FEW_VIEWS, run: Path | None = None) -> Report:
+def check(parser: DataOptions, run: Path | None = None) -> Report:
     """Check the masks of a scene; if nothing stops training, also at the depths of a run (its config.yml)."""
-    report = check_scene(parser, few_views)
+    report = check_scene(parser)
     if run is not None and not report.stops:
         options = ReprojectionOptions(method="voxel", run_size=True, parser=parser)
         add_areas(report, reproject_run(run, options))
     return report
 
 
-def check_scene(config: DataOptions, few_views: int = FEW_VIEWS) -> Report:
+def check_scene(config: DataOptions) -> Report:
     """Check the masks of the scene that ``config`` names, at the size of the photos.
 
     Raises ``UserError`` only for bad poses or photos.
     """
     config = replace(config, downscale_factor=1.0)
-    if few_views < 1:
-        raise UserError(f"min_views is {few_views}: give a number of views, at least 1.")
     scene, views, files = _files(config)
     with progress_bar("Reading masks") as progress:
-        coverage = check_files(files, few_views, progress)
+        coverage = check_files(files, progress)
     names = files.names or {}
     names = {i: names.get(i, "background" if i == 0 else f"class_{i}") for i in coverage.ids}
     report = Report(scene.root, list(files.stems), names, list(files.trained), coverage, list(coverage.issues))

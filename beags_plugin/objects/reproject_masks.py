@@ -36,16 +36,14 @@ if TYPE_CHECKING:
 class ReprojectionOptions:
     """Differences from the run's own preparation of masks; None keeps the run's choice.
 
-    masks: folder of other id images. classes: their classes.json. method, tau, depth: see
-    ``preparation.pipeline.PreparationConfig``. run_size: reproject at the size of the training instead of the photos'.
-    parser: options of ``beags-data`` instead of the run's own. data: folder of the scene if it has moved.
+    masks: folder of other id images. classes: their classes.json. method: of reprojection. run_size: reproject at the
+    size of the training instead of the photos'. parser: options of ``beags-data`` instead of the run's own. data:
+    folder of the scene if it has moved.
     """
 
     masks: Path | None = None
     classes: Path | None = None
     method: str | None = None
-    tau: float | None = None
-    depth: str | None = None
     run_size: bool = False
     parser: DataOptions | None = None
     data: Path | None = None
@@ -91,8 +89,8 @@ def reproject_run(config_path: Path, options: ReprojectionOptions) -> Reprojecte
     """
     run = Run(config_path, options.data)
     scene, manager = run.scene, data_to_reproject(run, options)
-    own = {"reprojection": options.method, "tau": options.tau, "depth": options.depth}
-    config = replace(scene.config.model_config.prepare, **{k: v for k, v in own.items() if v is not None})
+    config = scene.config.model_config.prepare
+    config = replace(config, reprojection=options.method or config.reprojection)
     if config.reprojection == "none":
         config = replace(config, reprojection="voxel")
     config.check()

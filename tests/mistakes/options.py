@@ -174,7 +174,6 @@ mistake("sample", "damage shared by more views than all")(beags("sample --shared
 mistake("sample", "pixels that fill no memory")(beags("sample --width 10000000 --height 10000000 --output out"))
 mistake("demo", "an empty folder")(lambda at: at.beags("demo --data", (at.root / "empty").mkdir() or at.root / "empty"))
 mistake("demo", "a downscale factor of 0")(beags("demo --downscale 0 --data {data}"))
-mistake("mask checks", "a number of views below 1")(beags("masks check --min-views 0 --data {data}"))
 mistake("mask checks", "a folder of masks that does not exist")(
     beags("masks reproject --load-config {run} --masks-path nowhere")
 )

@@ -73,9 +73,7 @@ class Coverage:
     issues: list[Issue] = field(default_factory=list)
 
 
-def check_files(
-    files: MaskFiles, few_views: int = FEW_VIEWS, progress: Callable[[int, int], None] | None = None
-) -> Coverage:
+def check_files(files: MaskFiles, progress: Callable[[int, int], None] | None = None) -> Coverage:
     """Read every mask once, and report mistakes in files as issues."""
     views = len(files.stems)
     counts: list[dict[int, int] | None] = [None] * views
@@ -122,7 +120,7 @@ def check_files(
         coverage.issues.append(
             Issue("note", "stored turned", sentence, "upright masks would be misplaced in the photos, unnoticed")
         )
-    coverage.issues += [*_few_views(files, coverage, few_views), *_unlabelled(files, coverage)]
+    coverage.issues += [*_few_views(files, coverage), *_unlabelled(files, coverage)]
     return coverage
 
 
@@ -241,11 +239,11 @@ def _names(files: MaskFiles, coverage: Coverage) -> Iterator[Issue]:
         )
 
 
-def _few_views(files: MaskFiles, coverage: Coverage, few_views: int) -> Iterator[Issue]:
+def _few_views(files: MaskFiles, coverage: Coverage) -> Iterator[Issue]:
     trained = np.asarray(files.trained, bool)
     for column, class_id in enumerate(coverage.ids):
         views = [int(view) for view in np.flatnonzero(trained & (coverage.pixels[:, column] > 0))]
-        if class_id == BACKGROUND or len(views) >= few_views:
+        if class_id == BACKGROUND or len(views) >= FEW_VIEWS:
             continue
         name = (files.names or {}).get(class_id, f"class_{class_id}")
         pixels = int(coverage.pixels[views, column].sum())
@@ -253,7 +251,7 @@ def _few_views(files: MaskFiles, coverage: Coverage, few_views: int) -> Iterator
             "warning",
             "few views",
             f"id {class_id} ({name}) is in {len(views)} of {int(trained.sum())} training views "
-            f"({files.paths(views) or 'only held-out views'}), fewer than {few_views}: mask it in more views, or set "
+            f"({files.paths(views) or 'only held-out views'}), fewer than {FEW_VIEWS}: mask it in more views, or set "
             "it to 0 if it is a mistake.",
             f"its {pixels} pixels can hardly be checked by votes: sides that no mask shows go to other classes",
             tuple(files.stems[view] for view in views),
