@@ -60,10 +60,12 @@ def certainty(
         figures["photos without poses"] = without
         if without:
             lines.append(f"{without} of {poses['photos']} photos have no pose and were left out.")
-    if (size := _size(run / "prepared/masks")) is not None:
-        figures["object pixels"] = list(size)
-        finer = ": for more detail, add --downscale 1" if max(size) < SMALL else ""
-        lines.append(f"The object has about {size[0]} x {size[1]} pixels in the photos as they were trained on{finer}.")
+    if boxes := _boxes(run / "prepared/masks"):
+        width, height = (int(side) for side in np.median([box for _, box in boxes], axis=0))
+        figures["object pixels"] = [width, height]
+        finer = ": for more detail, add --downscale 1" if max(width, height) < SMALL else ""
+        subject = "The object has" if len({class_id for class_id, _ in boxes}) == 1 else "Objects have"
+        lines.append(f"{subject} about {width} x {height} pixels in the photos as they were trained on{finer}.")
     if agreement is not None and (level != "sure" or (things is not None and things.found < things.asked)):
         lines += _next(again, agreement, masks)
     return Certainty(level, lines, figures)
@@ -94,17 +96,17 @@ def _next(again: str, agreement: dict[str, Any], masks: Path | None) -> list[str
     return lines
 
 
-def _size(masks: Path) -> tuple[int, int] | None:
-    """Return the median width and height of the objects' bounding box in the masks, pixels; None without an object."""
+def _boxes(masks: Path) -> list[tuple[int, tuple[int, int]]]:
+    """Return the class, and width and height of the bounding box in pixels, of every object in every mask."""
     from beags_plugin.labels.classes import read_id_mask
 
     boxes = []
     for path in sorted(masks.rglob("*.png")):
         labels = read_id_mask(path)
-        rows, columns = np.nonzero((labels != BACKGROUND) & (labels != IGNORE))
-        if len(rows):
-            boxes.append((np.ptp(columns) + 1, np.ptp(rows) + 1))
-    return None if not boxes else tuple(int(side) for side in np.median(boxes, axis=0))  # pyright: ignore[reportReturnType]
+        for class_id in np.setdiff1d(labels, [BACKGROUND, IGNORE]).tolist():
+            rows, columns = np.nonzero(labels == class_id)
+            boxes.append((class_id, (int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1)))
+    return boxes
 
 
 def write_doubt(run: Path, path: Path, apart: Path | None = None) -> bool:

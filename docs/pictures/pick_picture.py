@@ -22,9 +22,9 @@ class Picture:
     """config.yml of a run; a base will do."""
     output: Path = Path("docs/images/pick.jpg")
     """The file."""
-    click: tuple[int, int] = (655, 530)
+    click: tuple[int, int] = (497, 630)
     """Pixel of the window, across and down, on the object."""
-    name: str = "cone"
+    name: str = "ball"
     """What it is called."""
     width: int = 1280
     height: int = 900
@@ -37,7 +37,6 @@ class Picture:
             Page(address, self.width, self.height) as page,
         ):
             page.open_tab("Pick")
-            page.press("Hide Train Cams")
             page.tick("Click to pick")
             page.write("Name", self.name)
             settled(page)

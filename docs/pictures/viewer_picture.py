@@ -34,7 +34,7 @@ class Picture:
     """config.yml of a refined run."""
     output: Path = Path("docs/images/viewer.jpg")
     """The file."""
-    object: str = "cup"
+    object: str = "mug"
     """Name of the object that the panel's buttons are about."""
     width: int = 1280
     height: int = 900

@@ -50,6 +50,14 @@ def test_the_words_follow_from_what_the_masks_agree_on(tmp_path, agreement, over
     assert found.figures["object pixels"] == [40, 20]
 
 
+def test_the_size_is_that_of_one_object_where_there_are_several(tmp_path):
+    run = write_run(tmp_path / "run", None, [])
+    mask = np.zeros((60, 80), np.uint16)
+    mask[:20, :10], mask[40:, 50:60] = 1, 2
+    write_mask(run / "prepared/masks/a.png", mask)
+    assert "Objects have about 10 x 20 pixels" in " ".join(certainty(run, tmp_path).lines)
+
+
 def test_photos_without_poses_and_masks_to_delete_are_named(tmp_path):
     (tmp_path / "poses.json").write_text(json.dumps({"photos": 30, "registered": 26}))
     overruled = [f"v {index}" for index in range(8)]
