@@ -44,6 +44,7 @@ INTERFACES = {  # entry-point group to module
     "beags.mask_sources": "beags_plugin.masks.sources.base",
     "beags.exporters": "beags_plugin.export.base",
     "beags.importers": "beags_plugin.importers.base",
+    "beags.sample_families": "beags_plugin.sample.family",
     "beags.engines": "beags_benchmarks.experiments.engines.interface",
 }
 

@@ -139,9 +139,9 @@ class Sample:
     views: int = 60
     """Views to train on; 12 more are held out."""
     family: str = "tabletop"
-    """tabletop: plain solids that touch, seen from all sides. turntable: the same, but they turn and the room stands.
-    room: a furnished room with textured objects that lean on and stand in one another, seen from one side. desk: such
-    objects put close together, seen from all sides."""
+    """tabletop: plain solids that touch. desk: textured objects close together in a furnished room. Both are seen from
+    all sides. Of benchmarks/: turntable, where the solids turn and the room stands; room, where such objects lean on
+    and stand in one another, seen from one side."""
     exposure: float = 0.0
     """The largest difference of a photo's exposure from the mean, in stops (EV), at most 6."""
     white_balance: float = 0.0

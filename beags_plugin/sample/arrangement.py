@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beags_plugin.sample.scene import Contact, Scene, Thing
-from beags_plugin.sample.solids import Ball, Cone, Primitive, Solid, Tube, dot, slab
+from beags_plugin.sample.solids import Ball, Cone, Primitive, Solid, Tube, dot, slab, turn_z
 from beags_plugin.sample.textures import (
     Noise,
     Texture,
@@ -51,12 +51,6 @@ class Still(Scene):
             ground = np.where(directions[:, 2] < 0.0, -origin[2] / directions[:, 2], np.inf)
         part = np.where(ground < t, GROUND, DOME).astype(np.int32)
         return hit_fixtures(self.fixtures, origin, directions, np.minimum(t, ground), part, DOME - 1)
-
-
-def turn_z(angle: float) -> np.ndarray:
-    """Return the rotation [3, 3] about z by an angle in radians."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _textures(names: list[str], hue: float, noise: Noise, generator: np.random.Generator) -> dict[str, Texture]:

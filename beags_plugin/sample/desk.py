@@ -7,14 +7,14 @@ from threading import Lock
 
 import numpy as np
 
-from beags_plugin.sample.arrangement import turn_z
+from beags_plugin.sample.family import Family
 from beags_plugin.sample.light_map import LightMap
 from beags_plugin.sample.meshes import SEGMENTS, Mesh, block, rays
 from beags_plugin.sample.room import SHELL, Room, Shell, add_group, furnished
 from beags_plugin.sample.room_light import SHARES, RoomLight
-from beags_plugin.sample.room_things import Group, Stock, make_groups
+from beags_plugin.sample.room_things import Stock, make_ball, make_crate, make_mug, make_vase, standing
 from beags_plugin.sample.scene import Contact, Thing
-from beags_plugin.sample.solids import turned
+from beags_plugin.sample.solids import turn_z, turned
 from beags_plugin.sample.textures import Noise
 from beags_plugin.sample.views import View, direction, held_out, look_at, make_view
 
@@ -37,36 +37,31 @@ def make_desk(seed: int) -> Room:
     shell = Shell.of(seed)
     noise = Noise(generator)
     hue = float(generator.uniform())
-    groups = make_groups(Stock(generator, noise, hue, spread=0.5))
-    named = {thing.name: thing for group in groups for thing in group.things}
-    crate = named["crate"]
+    stock = Stock(generator, noise, hue, spread=0.5)
+    stack, mug = make_crate(stock), make_mug(stock, stock.about(0.135), stock.about(0.24))
+    generator.random(9)  # The random numbers of benchmarks' room come in between: for its spoon and its basket,
+    ball, vase = make_ball(stock), make_vase(stock)
+    generator.random(7)  # and for its frame.
+    crate = stack.things[0]
     x, y = crate.solid.vertices[:, :2].max(axis=0)
     turn = shell.turn @ turn_z(generator.uniform(0.0, 2.0 * np.pi))
     things: list[Thing[Mesh]] = []
     contacts: list[Contact] = []
-    add_group(things, contacts, groups[0], turn, -turn @ (crate.position * [1.0, 1.0, 0.0]))
+    add_group(things, contacts, stack, turn, -turn @ (crate.position * [1.0, 1.0, 0.0]))
     # Each thing stands near an end of its side, so that photos show the other end; the mug's handle points along it.
-    for name, face, gap, steps, along in (
-        ("mug", 0.5 * np.pi, x, 0, generator.uniform(-0.08, -0.02)),
-        ("vase", 0.0, y, generator.integers(SEGMENTS), generator.uniform(-0.12, -0.07)),
-        ("ball", np.pi, y, generator.integers(SEGMENTS), generator.uniform(-0.12, -0.06)),
+    for thing, face, gap, steps, along in (
+        (mug, 0.5 * np.pi, x, 0, generator.uniform(-0.08, -0.02)),
+        (vase, 0.0, y, generator.integers(SEGMENTS), generator.uniform(-0.12, -0.07)),
+        (ball, np.pi, y, generator.integers(SEGMENTS), generator.uniform(-0.12, -0.06)),
     ):
         spin, way = turn_z(2.0 * np.pi * steps / SEGMENTS), turn @ turn_z(face)  # y points away from the crate.
-        corners = turned(named[name].solid.vertices, spin.T)
+        corners = turned(thing.solid.vertices, spin.T)
         nearest = corners[np.argmin(corners[:, 1].round(9))]
         shift = np.array([along, gap - nearest[1], 0.0])
-        alone = _standing(named[name])
+        alone = standing(thing)
         add_group(things, contacts, alone, way @ spin, way @ shift)
         contacts.append(Contact(len(things), 1, way @ (shift + nearest + alone.things[0].position)))
     return furnished(things, contacts, shell, generator, noise, hue)
-
-
-def _standing(thing: Thing[Mesh]) -> Group:
-    """Return a thing alone, upright on the table."""
-    group = Group()
-    group.place(thing.name, thing.solid, thing.texture, (0.0, 0.0, float(-thing.solid.vertices[:, 2].min())))
-    group.touch(thing.name, "table", 0.0, 0.0, 0.0)
-    return group
 
 
 class DeskLight(RoomLight):
@@ -109,7 +104,7 @@ class DeskLight(RoomLight):
         return colours
 
     def _albedo(self, which: int, local: np.ndarray) -> np.ndarray:
-        return self._paper(local) if which == SHELL else self.room.part(which).texture(local)
+        return self.paper(local) if which == SHELL else self.room.part(which).texture(local)
 
     def _map(self, which: int) -> LightMap:
         """Return the light of a part, as in ``Hits.surface``; the first call measures it."""
@@ -133,7 +128,9 @@ class DeskLight(RoomLight):
 
         def measure(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
             places, ways = turned(points, rotation.T) + position, turned(normals, rotation.T)
-            return np.mean([self._light(places, ways, np.full(len(places), share)) for share in range(SHARES)], axis=0)
+            return np.mean(
+                [self.light_at(places, ways, np.full(len(places), share)) for share in range(SHARES)], axis=0
+            )
 
         return measure
 
@@ -155,3 +152,6 @@ def desk_views(seed: int, width: int, height: int, num_train: int, num_test: int
         pose = look_at(place, target, 0.04 * spread[6])
         views.append(make_view(i, i in tests, pose, LENS, width, height))
     return views
+
+
+DESK = Family(make_desk, DeskLight, desk_views)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from beags_plugin.sample.arrangement import DOME, DOME_RADIUS, GROUND, Still, turn_z
+from beags_plugin.sample.arrangement import DOME, DOME_RADIUS, GROUND, Still, make_still
+from beags_plugin.sample.family import Family
 from beags_plugin.sample.scene import Thing
 from beags_plugin.sample.solids import Solid, dot, turned
 from beags_plugin.sample.tracing import seen_share
+from beags_plugin.sample.views import make_views
 
 SUN = np.array([1.22, 1.13, 1.0])
 SKY = np.array([0.36, 0.39, 0.44])
@@ -130,11 +132,4 @@ class Light:
         return colours
 
 
-class TurntableLight(Light):
-    """The light of a still life that turns before a fixed camera, while ground and curtain stand still.
-
-    The lamps turn with the objects, so that shading and shadows stay the same.
-    """
-
-    def _standing(self, points: np.ndarray, center: np.ndarray) -> np.ndarray:
-        return turned(points, turn_z(float(np.arctan2(center[1], center[0]))))
+TABLETOP = Family(make_still, Light, make_views)

@@ -1,7 +1,4 @@
-"""A closed room: walls, furniture and, on a table, objects that lean on, stand on and lie in one another.
-
-Cameras pass on one side of the table, so that photos show parts of the room well, hardly, or not at all.
-"""
+"""A closed room: walls, furniture and, on a table, objects that touch one another."""
 
 from __future__ import annotations
 
@@ -10,23 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from beags_plugin.sample import prints
-from beags_plugin.sample.arrangement import turn_z
 from beags_plugin.sample.meshes import Mesh, Part, block, extrude, moved
 from beags_plugin.sample.prints import Paint, Print
-from beags_plugin.sample.room_things import Group, Stock, make_groups, superellipse
+from beags_plugin.sample.room_things import Group, superellipse
 from beags_plugin.sample.scene import Contact, Scene, Thing
-from beags_plugin.sample.solids import turned
+from beags_plugin.sample.solids import turn_z, turned
 from beags_plugin.sample.textures import Noise, linear_from_hsv
 from beags_plugin.sample.tracing import hit_fixtures
-from beags_plugin.sample.views import View, direction, held_out, look_at, make_view
 
 SHELL = 0
-SLOTS = ((-0.66, 0.34), (0.66, 0.36), (0.0, 0.0), (-0.58, -0.40), (0.58, -0.38))
-"""Positions of the groups on the table; its middle is the world's origin."""
-ARC = 1.85
-"""Radians to either side of the table's front within which photos are taken."""
-ELEVATIONS = (0.24, 0.50, 0.80)
-TARGET = np.array([0.0, 0.0, 0.14])
 
 
 @dataclass(frozen=True)
@@ -73,22 +62,6 @@ class Room(Scene):
         return self.things[which - 1] if which > 0 else self.fixtures[-1 - which]
 
 
-def make_room(seed: int) -> Room:
-    """Make the room of a seed, which decides sizes, positions, rotations, textures and colours."""
-    generator = np.random.default_rng([seed, 12])
-    shell = Shell.of(seed)
-    noise = Noise(generator)
-    hue = float(generator.uniform())
-    groups = make_groups(Stock(generator, noise, hue))
-    things: list[Thing[Mesh]] = []
-    contacts: list[Contact] = []
-    for group, slot in zip(groups, generator.permutation(np.array(SLOTS)), strict=True):
-        place = np.array([*(slot + generator.uniform(-0.03, 0.03, 2)), 0.0])
-        turn = shell.turn @ turn_z(generator.uniform(0.0, 2.0 * np.pi))
-        add_group(things, contacts, group, turn, shell.turn @ place)
-    return furnished(things, contacts, shell, generator, noise, hue)
-
-
 def furnished(
     things: list[Thing[Mesh]], contacts: list[Contact], shell: Shell, generator: np.random.Generator, noise: Noise,
     hue: float,
@@ -114,32 +87,6 @@ def add_group(
         )
         ids[thing.name] = len(things)
     contacts += [Contact(ids[a], ids[b], turn @ np.array(point) + place) for a, b, point in group.contacts]
-
-
-def room_views(seed: int, width: int, height: int, num_train: int, num_test: int) -> list[View]:
-    """Make three passes along an arc in front of the table.
-
-    Every fourth test view lies beyond the ends of the arc, and shows parts that photos hardly show.
-    """
-    generator = np.random.default_rng([seed, 2])
-    turn = Shell.of(seed).turn
-    total, tests = num_train + num_test, held_out(num_train, num_test)
-    beyond = tests[2::4]
-    views = []
-    for i in range(total):
-        progress = i * len(ELEVATIONS) / total
-        level = int(progress)
-        along = (2.0 * (progress - level) - 1.0) * (-1.0) ** level * ARC  # Every second pass goes back.
-        spread = generator.uniform(-1.0, 1.0, 7)
-        if i in beyond:
-            along = np.copysign(ARC + 0.25 + 0.12 * spread[0], along)
-        azimuth = along + 0.05 * spread[0] - 0.5 * np.pi
-        elevation = ELEVATIONS[level] + 0.06 * spread[1]
-        target = TARGET + 0.12 * spread[2:5] * [1.0, 1.0, 0.5]
-        place = target + 2.15 * (1.0 + 0.08 * spread[5]) * direction(azimuth, elevation)
-        pose = look_at(turn @ place, turn @ target, 0.04 * spread[6])
-        views.append(make_view(i, i in tests, pose, 0.98, width, height))
-    return views
 
 
 def _fixtures(shell: Shell, generator: np.random.Generator, noise: Noise, hue: float) -> tuple[Thing[Mesh], ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from beags_plugin.sample.meshes import block, moved, raycaster, rays
-from beags_plugin.sample.room import SHELL, Room
+from beags_plugin.sample.room import Room
 from beags_plugin.sample.solids import dot, turned
 
 LIFT = 1e-3  # distance from the surface at which shadow rays start, so that they do not hit it; world units
@@ -24,7 +24,7 @@ def _spiral(count: int) -> np.ndarray:
 
 
 class RoomLight:
-    """The light of a room; see ``scene.Lighting``."""
+    """What measures the light at points of a room."""
 
     def __init__(self, room: Room, lamp_samples: int = 24, bounce_samples: int = 16) -> None:
         self.room = room
@@ -44,7 +44,7 @@ class RoomLight:
     def _open(self, points: np.ndarray, ways: np.ndarray, end: float) -> np.ndarray:
         return ~self._blockers.test_occlusions(rays(points, ways), 0.0, end).numpy()
 
-    def _light(self, points: np.ndarray, normals: np.ndarray, share: np.ndarray) -> np.ndarray:
+    def light_at(self, points: np.ndarray, normals: np.ndarray, share: np.ndarray) -> np.ndarray:
         """Return [N, 3] light at surface points [N, 3] with normals [N, 3], from the samples of each one's share."""
         lifted = points + LIFT * normals
         direct, bounced = np.zeros(len(points)), np.zeros(len(points))
@@ -63,32 +63,7 @@ class RoomLight:
         bounced = 0.25 + 0.75 * SHARES / len(self._ways) * bounced
         return direct[:, None] * LAMP + bounced[:, None] * BOUNCE
 
-    def colours(
-        self, points: np.ndarray, surface: np.ndarray, directions: np.ndarray, center: np.ndarray
-    ) -> np.ndarray:
-        albedo, normals = np.empty_like(points), np.empty_like(points)
-        for which in np.unique(surface):
-            on = np.flatnonzero(surface == which)
-            if which == SHELL:
-                albedo[on], normals[on] = self._shell(points[on])
-            else:
-                thing = self.room.part(which)
-                local, way = thing.to_local(points[on]), turned(directions[on], thing.rotation)
-                albedo[on] = thing.texture(local)
-                normals[on] = turned(thing.solid.normals(local, way), thing.rotation.T)
-        return albedo * self._light(points, normals, np.arange(len(points)) % SHARES)
-
-    def _shell(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return albedo and normals of walls, floor and ceiling."""
-        shell = self.room.shell
-        local = shell.to_local(points)
-        axis = np.argmax(np.abs(local) / shell.half, axis=1)
-        rows = np.arange(len(points))
-        normals = np.zeros_like(points)
-        normals[rows, axis] = -np.sign(local[rows, axis])
-        return self._paper(local), turned(normals, shell.turn.T)
-
-    def _paper(self, local: np.ndarray) -> np.ndarray:
+    def paper(self, local: np.ndarray) -> np.ndarray:
         """Return the shell's albedo at points [N, 3] in its frame; that of the panel is 10, so that it is white."""
         shell = self.room.shell
         ceiling = (np.argmax(np.abs(local) / shell.half, axis=1) == 2) & (local[:, 2] > 0.0)

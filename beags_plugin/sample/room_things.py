@@ -1,4 +1,4 @@
-"""The objects of a room, in groups that touch exactly."""
+"""The objects of a desk, alone or in groups that touch exactly."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from beags_plugin.sample import prints
-from beags_plugin.sample.arrangement import turn_z
 from beags_plugin.sample.meshes import Mesh, block, extrude, lathe, sweep
 from beags_plugin.sample.prints import Paint
 from beags_plugin.sample.scene import Thing
-from beags_plugin.sample.solids import turned
+from beags_plugin.sample.solids import turn_z, turned
 from beags_plugin.sample.textures import Noise, linear_from_hsv
+
+MUG_WALL, MUG_FLOOR = 0.022, 0.025
+"""Thickness of the mug, world units."""
 
 
 @dataclass
@@ -60,12 +62,15 @@ class Stock:
         return linear_from_hsv(tint, self.generator.uniform(0.3, 0.6), 0.9), linear_from_hsv(tint + 0.08, 0.7, 0.36)
 
 
-def make_groups(stock: Stock) -> list[Group]:
-    """Make all groups."""
-    return [make(stock) for make in (_crate, _mug, _basket, _vase, _frame)]
+def standing(thing: Thing[Mesh]) -> Group:
+    """Return a thing alone, upright on the table."""
+    group = Group()
+    group.place(thing.name, thing.solid, thing.texture, (0.0, 0.0, float(-thing.solid.vertices[:, 2].min())))
+    group.touch(thing.name, "table", 0.0, 0.0, 0.0)
+    return group
 
 
-def _crate(stock: Stock) -> Group:
+def make_crate(stock: Stock) -> Group:
     """Make a crate, a book that leans on it, and a star that lies on it."""
     group, about, colours, noise = Group(), stock.about, stock.colours, stock.noise
     x, y, top = about(0.20), about(0.15), about(0.30)
@@ -99,93 +104,42 @@ def _crate(stock: Stock) -> Group:
     return group
 
 
-def _mug(stock: Stock) -> Group:
-    """Make a mug with a thin handle, and a spoon that leans in it."""
-    group, about, colours, noise = Group(), stock.about, stock.colours, stock.noise
-    outside, high = about(0.135), about(0.24)
-    inside, floor = outside - 0.022, 0.025
+def make_mug(stock: Stock, outside: float, high: float) -> Thing[Mesh]:
+    """Make a mug of this radius and height, with a thin handle."""
+    colours, noise = stock.colours, stock.noise
+    inside = outside - MUG_WALL
     wall = lathe(np.array([(0, 0), (0.93 * outside, 0), (outside, 0.02), (outside, high), (inside, high),
-                           (inside, floor), (0, floor)]))  # fmt: skip
-    angle = np.linspace(0.0, np.pi, 25)
-    bow = np.stack([outside - 0.012 + about(0.10) * np.sin(angle), 0.5 * high + 0.33 * high * np.cos(angle)], axis=1)
+                           (inside, MUG_FLOOR), (0, MUG_FLOOR)]))  # fmt: skip
+    angle, reach = np.linspace(0.0, np.pi, 25), stock.about(0.10)
+    bow = np.stack([outside - 0.012 + reach * np.sin(angle), 0.5 * high + 0.33 * high * np.cos(angle)], axis=1)
     print_ = prints.within(prints.plain(noise, colours()[0]), (0.0, 0.5 * high + 0.08, 9.0, 0.7 * high,
                            prints.lettering(noise, *colours(), size=0.035)))  # fmt: skip
-    group.place("mug", Mesh(wall, sweep(bow, 0.016)), prints.around(print_, outside))
-    group.touch("mug", "table", 0.0, 0.0, 0.0)
-
-    # In the plane y = 0, the spoon's round end lies on the mug's floor, and its shaft on the inner edge of the rim.
-    shaft = 0.014
-    start, rim = np.array([-0.55 * inside, floor + shaft]), np.array([inside, high])
-    reach = float(np.linalg.norm(rim - start))
-    tilt = float(np.arctan2(rim[1] - start[1], rim[0] - start[0]) + np.arcsin(shaft / reach))
-    lowest = 0.5 * np.pi - tilt  # angle from the pole of the end's lowest point, where a vertex must lie
-    polar = np.concatenate([np.linspace(0.0, lowest, 4)[:-1], np.linspace(lowest, 0.5 * np.pi, 5)])
-    length, bowl = about(0.42), 0.045
-    end = np.stack([shaft * np.sin(polar), -shaft * np.cos(polar)], axis=1)
-    end[0, 0] = 0.0
-    swell = np.linspace(np.arcsin(shaft / bowl), np.pi, 16)
-    head = np.stack([bowl * np.sin(swell), length + 0.07 * (np.cos(swell[0]) - np.cos(swell))], axis=1)
-    head[-1, 0] = 0.0
-    profile = np.concatenate([end, head])
-    flat = np.concatenate([np.ones(len(end)), np.linspace(1.0, 0.3, 6), np.full(10, 0.3)])
-    rotation = np.array([[np.sin(tilt), 0.0, np.cos(tilt)], [0.0, 1.0, 0.0], [-np.cos(tilt), 0.0, np.sin(tilt)]])
-    turn = turn_z(0.75 * np.pi)  # angle from the handle, at which the mug has vertices
-    grain = prints.wood(noise, *colours(), plank=0.05)
-    tip = turn @ np.array([start[0], 0.0, start[1]])
-    group.place("spoon", Mesh(lathe(profile, flat)), lambda p: grain(p[:, 2], p[:, 0]), tuple(tip), turn @ rotation)
-    group.touch("spoon", "mug", *(turn @ [start[0], 0.0, floor]))
-    group.touch("spoon", "mug", *(turn @ [rim[0], 0.0, rim[1]]))
-    return group
+    return _at_rest("mug", Mesh(wall, sweep(bow, 0.016)), prints.around(print_, outside))
 
 
-def _basket(stock: Stock) -> Group:
-    """Make a basket with a hoop, and a ball that lies in it."""
-    group, about, colours, noise = Group(), stock.about, stock.colours, stock.noise
-    base, brim, high, thick = about(0.15), about(0.24), about(0.17), 0.026
-    profile = [(0, 0), (base, 0), (brim, 0.7 * high), (brim, high), (brim - thick, high), (brim - thick, 0.7 * high),
-               (base - 0.5 * thick, thick), (0, thick)]  # fmt: skip
-    angle = np.linspace(0.0, np.pi, 49)
-    middle = brim - 0.5 * thick
-    hoop = np.stack([-middle * np.cos(angle), high - 0.03 + about(0.27) * np.sin(angle)], axis=1)
-    straw = prints.weave(noise, *colours(), size=0.045)
-    group.place("basket", Mesh(lathe(np.array(profile)), sweep(hoop, 0.011)), prints.around(straw, brim))
-    group.touch("basket", "table", 0.0, 0.0, 0.0)
-    radius = about(0.12)
+def make_ball(stock: Stock) -> Thing[Mesh]:
+    """Make a ball around the origin."""
+    radius = stock.about(0.12)
     polar = np.linspace(0.0, np.pi, 33)
     ball = np.stack([radius * np.sin(polar), -radius * np.cos(polar)], axis=1)
     ball[[0, -1], 0] = 0.0
-    light, dark = colours()
-    panels = prints.stripes(noise, np.stack([light, dark, 1.0 - dark]), radius * np.pi / 5.0)
-    group.place("ball", Mesh(lathe(ball)), lambda p: panels(radius * np.arctan2(p[:, 1], p[:, 0]), p[:, 2]),
-                (0.0, 0.0, thick + radius))  # fmt: skip
-    group.touch("ball", "basket", 0.0, 0.0, thick)
-    return group
+    light, dark = stock.colours()
+    panels = prints.stripes(stock.noise, np.stack([light, dark, 1.0 - dark]), radius * np.pi / 5.0)
+    return _at_rest("ball", Mesh(lathe(ball)), lambda p: panels(radius * np.arctan2(p[:, 1], p[:, 0]), p[:, 2]))
 
 
-def _vase(stock: Stock) -> Group:
+def make_vase(stock: Stock) -> Thing[Mesh]:
     """Make a vase with a narrow neck, open at the top."""
-    group, about, colours, noise = Group(), stock.about, stock.colours, stock.noise
+    about, colours = stock.about, stock.colours
     wide, high = about(0.14), about(0.46)
     up = np.linspace(0.0, 1.0, 40)
     radius = wide * (0.55 + 0.45 * np.sin(0.6 + 4.4 * up) + 0.25 * up**6)
     outer = np.stack([radius, high * up], axis=1)
     inner = outer[:9:-1] - [0.02, 0.0]
     profile = np.concatenate([[(0.0, 0.0)], outer, inner, [(0.0, inner[-1, 1])]])
-    glaze = prints.stripes(noise, np.stack([*colours(), colours()[0]]), 0.06)
-    group.place("vase", Mesh(lathe(profile)), prints.around(glaze, 0.5 * wide))
-    group.touch("vase", "table", 0.0, 0.0, 0.0)
-    return group
+    glaze = prints.stripes(stock.noise, np.stack([*colours(), colours()[0]]), 0.06)
+    return _at_rest("vase", Mesh(lathe(profile)), prints.around(glaze, 0.5 * wide))
 
 
-def _frame(stock: Stock) -> Group:
-    """Make a standing frame with rounded corners and a hole."""
-    group, about, colours, noise = Group(), stock.about, stock.colours, stock.noise
-    wide, high, deep = about(0.22), about(0.2), about(0.055)
-    outer = superellipse(wide, high, 3.5, 48)
-    outer[:, 1] = np.maximum(outer[:, 1], -0.9 * high)
-    band = extrude(outer, superellipse(0.72 * wide, 0.68 * high, 3.0, 48), -deep, deep)
-    upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    tiles = prints.bricks(noise, colours()[0], colours()[1], 0.045)
-    group.place("frame", Mesh(band), lambda p: tiles(p[:, 0] + p[:, 2], p[:, 1]), (0.0, 0.0, 0.9 * high), upright)
-    group.touch("frame", "table", 0.0, 0.0, 0.0)
-    return group
+def _at_rest(name: str, mesh: Mesh, texture: Paint) -> Thing[Mesh]:
+    return Thing(name, mesh, np.eye(3), np.zeros(3), texture)

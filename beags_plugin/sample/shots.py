@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from beags_plugin.sample.exposure import Exposed, photo_gains
-from beags_plugin.sample.families import Family
+from beags_plugin.sample.family import Family
 from beags_plugin.sample.lots import lowest_lots
 from beags_plugin.sample.scene import Lighting, Scene
 from beags_plugin.sample.tracing import first_hits

@@ -48,6 +48,12 @@ def turned(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return np.stack([dot(points, matrix[None, :, j]) for j in range(matrix.shape[1])], axis=1)
 
 
+def turn_z(angle: float) -> np.ndarray:
+    """Return the rotation [3, 3] about z by an angle in radians."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
 def _quadratic(a: np.ndarray, half_b: np.ndarray, c: np.ndarray) -> Interval:
     """Return where a t^2 + 2 half_b t + c <= 0 for a > 0; for a = 0 (a ray along a tube) everywhere or nowhere."""
     discriminant = half_b * half_b - a * c

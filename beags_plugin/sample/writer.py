@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from beags_plugin.sample import FAMILIES
 from beags_plugin.sample.degrade import Degradation, degrade_mask, dropped_views, resolve_degradation
 from beags_plugin.sample.exposure import LARGEST_STOPS
-from beags_plugin.sample.families import FAMILIES
 from beags_plugin.sample.points import SeedPoints, find_tracks, seed_points
 from beags_plugin.sample.seen import Photo, seen_part, shown_points, visible_surface, well_seen
 from beags_plugin.sample.shared_damage import flawed_mask, plan_flaws
 from beags_plugin.sample.shots import Shot, plan_shots, taken
 from beags_plugin.sample.views import Picture, View, render_pixels, render_removed, surface_without
-from beags_plugin.system.errors import UserError, check_choice, unwritable, writing
+from beags_plugin.system.errors import UserError, unwritable, writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.reading.ply import write_vertices
 
@@ -88,7 +88,7 @@ class SampleConfig:
             )
         if not 0.0 <= self.shared_damage <= 1.0:
             raise UserError(f"the sample's shared_damage is {self.shared_damage}: give a share of views from 0 to 1.")
-        check_choice(self.family, FAMILIES, "family of scenes")
+        FAMILIES.check(self.family)
         resolve_degradation(self.degradation)
 
     def as_dict(self) -> dict[str, Any]:
@@ -158,7 +158,7 @@ def write_sample(
 
 
 def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], None] | None) -> None:
-    family = FAMILIES[config.family]
+    family = FAMILIES.get(config.family)
     views = family.views(config.seed, config.width, config.height, config.num_train, config.num_test)
     shots = plan_shots(family, config.seed, views, config.exposure, config.white_balance, config.moved)
     degradation = resolve_degradation(config.degradation)

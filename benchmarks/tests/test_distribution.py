@@ -36,7 +36,8 @@ def test_the_wheel_has_every_file_and_adds_a_command(tmp_path):
         text = archive.read(points).decode()
     package = source / "beags_benchmarks"
     assert names == {path.relative_to(source).as_posix() for path in package.rglob("*") if path.is_file()}
-    assert text.strip() == "[beags.commands]\nbench = beags_benchmarks.experiments.commands:Bench"
+    assert text.split("\n\n")[0] == "[beags.commands]\nbench = beags_benchmarks.experiments.commands:Bench"
+    assert "[beags.sample_families]\nroom = beags_benchmarks.samples.room:ROOM\n" in text
 
 
 def test_a_package_that_extends_beags_is_in_the_digest_of_trials(tmp_path, monkeypatch):

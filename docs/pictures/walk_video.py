@@ -12,8 +12,7 @@ import av
 import numpy as np
 import tyro
 
-from beags_plugin.sample.room import make_room
-from beags_plugin.sample.room_light import RoomLight
+from beags_benchmarks.samples.room import TracedLight, make_room
 from beags_plugin.sample.views import View, look_at, render_image
 from beags_plugin.system.progress import counted, progress_bar
 
@@ -41,7 +40,7 @@ class Walk:
         things = [thing for thing in room.things if thing.name in self.thing]
         middle = np.array([*things[0].position[:2], 0.0])
         room = replace(room, things=tuple(replace(one, position=one.position - middle) for one in things), contacts=())
-        light, height = RoomLight(room), 3 * self.width // 4
+        light, height = TracedLight(room), 3 * self.width // 4
         self.output.parent.mkdir(parents=True, exist_ok=True)
         with progress_bar("Filming") as progress, av.open(str(self.output), "w") as container:
             stream = container.add_stream("h264", rate=10, options={"crf": "16"})

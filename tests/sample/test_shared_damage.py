@@ -12,8 +12,8 @@ from scipy.spatial.distance import cdist
 from test_shots import files, splits
 from test_writer import TINY, grey
 
+from beags_plugin.sample import FAMILIES
 from beags_plugin.sample.degrade import PRESETS, degrade_mask
-from beags_plugin.sample.families import FAMILIES
 from beags_plugin.sample.seen import Photo, shown_in
 from beags_plugin.sample.shared_damage import Beyond, Near, flawed_mask, plan_flaws
 from beags_plugin.sample.tracing import first_hits
@@ -24,7 +24,7 @@ from beags_plugin.system.errors import UserError
 SEED, SHARE = 2, 0.6
 
 
-@pytest.fixture(scope="module", params=FAMILIES)
+@pytest.fixture(scope="module", params=FAMILIES.names())
 def family(request):
     return request.param
 
@@ -32,7 +32,7 @@ def family(request):
 @pytest.fixture(scope="module")
 def shown(family):
     """(scene, flaws, photos, labels, masks, points) of twelve training views."""
-    made = FAMILIES[family]
+    made = FAMILIES.get(family)
     scene = made.scene(SEED)
     views = [view for view in made.views(SEED, 96, 72, 12, 1) if view.split == "train"]
     flaws = plan_flaws(scene, [view.name for view in views], SEED, SHARE)
@@ -114,7 +114,7 @@ def test_views_agree_on_what_is_wrong(shown):
 @pytest.mark.parametrize("family", ["tabletop", "room"])
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_wrong_is_at_the_foot_and_can_be_seen(family, seed):
-    made = FAMILIES[family]
+    made = FAMILIES.get(family)
     scene = made.scene(seed)
     view = made.views(seed, 160, 120, 12, 1)[6]
     photo, labels, points = traced(scene, view)
@@ -137,7 +137,7 @@ def test_what_is_wrong_is_at_the_foot_and_can_be_seen(family, seed):
 
 
 def test_the_seed_decides(family):
-    scene, names = FAMILIES[family].scene(SEED), [f"view_{i:03d}" for i in range(20)]
+    scene, names = FAMILIES.get(family).scene(SEED), [f"view_{i:03d}" for i in range(20)]
 
     def plan(seed, order=1, share=SHARE):
         return [
@@ -162,7 +162,7 @@ def test_a_sample_has_it_in_training_masks_alone(family, tmp_path):
     assert before.keys() == now.keys() and "sample.json" in different
     train, _ = splits(plain)
     assert {"sample.json"} < different <= {"sample.json", *(f"masks/{stem}.png" for stem in train)}
-    classes = 1 + len(FAMILIES[family].scene(config.seed).things)
+    classes = 1 + len(FAMILIES.get(family).scene(config.seed).things)
     for stem in train:
         truth = grey(plain / f"ground_truth/masks/{stem}.png")
         assert np.array_equal(grey(plain / f"masks/{stem}.png"), truth)

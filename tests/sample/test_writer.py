@@ -12,15 +12,14 @@ from PIL import Image
 from scene_distances import distance, from_background
 from scipy.ndimage import grey_dilation
 
-from beags_plugin.sample import writer
-from beags_plugin.sample.families import FAMILIES
+from beags_plugin.sample import FAMILIES, writer
 from beags_plugin.sample.writer import SampleConfig, is_sample, write_sample
 from beags_plugin.system.errors import UserError
 
 TINY = SampleConfig(seed=3, width=24, height=16, num_train=5, num_test=2, num_points=101, degradation="strong")
 
 
-CLASSES = {"tabletop": 8, "room": 10}  # number of classes, with the background
+CLASSES = {"tabletop": 8, "desk": 7}  # number of classes, with the background
 
 
 @pytest.fixture(scope="module", params=CLASSES)
@@ -87,7 +86,7 @@ def test_seed_points_lie_on_surfaces(folder, config):
     assert b"element vertex 101\n" in header
     records = np.frombuffer(body, dtype=[("p", "<f4", 3), ("c", "u1", 3)])
     assert len(records) == 101
-    still = FAMILIES[config.family].scene(TINY.seed)
+    still = FAMILIES.get(config.family).scene(TINY.seed)
     points = records["p"].astype(float)
     near = [from_background(still, points)]
     near += [np.abs(distance(thing, points)) for thing in still.things]
@@ -179,4 +178,13 @@ def test_a_foreign_folder_is_left_alone(tmp_path):
 def test_bad_configs_are_refused(tmp_path, wrong):
     with pytest.raises(UserError):
         write_sample(tmp_path / "s", SampleConfig(**wrong))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_family_of_benchmarks_says_how_to_install_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(FAMILIES, "names", lambda: ["desk", "tabletop"])
+    with pytest.raises(
+        UserError, match="generated scene 'room' is not part of beags itself: run pip install ./benchmarks"
+    ):
+        write_sample(tmp_path / "s", SampleConfig(family="room"))
     assert list(tmp_path.iterdir()) == []

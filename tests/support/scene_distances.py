@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from open3d.core import Tensor
 
 from beags_plugin.sample.arrangement import DOME_RADIUS, Still
 from beags_plugin.sample.meshes import Mesh
 from beags_plugin.sample.room import Room
+from beags_plugin.sample.solids import turned
 
 
 def distance(thing, points):
@@ -43,3 +45,25 @@ def from_background(scene, points):
         off = np.flatnonzero(found > 1e-5)  # most points are on the walls
         found[off] = np.minimum(found[off], distance(fixture, points[off]))
     return found
+
+
+def assert_touching(made: Room, touching: set[tuple[str, str]]) -> None:
+    """Things touch in these pairs and on the table, exactly, and nowhere run into one another or into walls."""
+    names = made.class_names
+    for contact in made.contacts:
+        for class_id in (contact.first, contact.second):
+            off = distance(made.things[class_id - 1], contact.point[None])[0] if class_id else contact.point[2]
+            assert abs(off) < 1e-9
+    assert {(names[c.first], names[c.second]) for c in made.contacts if c.second} == touching
+    assert set(names) - {0} == {c.first for c in made.contacts}
+    generator = np.random.default_rng(0)
+    for thing in made.things:
+        corners = thing.solid.vertices[thing.solid.triangles]
+        weights = generator.dirichlet([1.0] * 3, len(corners))
+        points = turned(np.einsum("tc,tck->tk", weights, corners), thing.rotation.T) + thing.position
+        assert points[:, 2].min() > -1e-9 and np.abs(made.shell.to_local(points)[:, :2]).max() < 3.5
+        for other in made.things:
+            if other is not thing:
+                local = Tensor(other.to_local(points).astype(np.float32))
+                inside = points[other.solid.caster.compute_occupancy(local, nsamples=3).numpy() > 0]
+                assert len(inside) == 0 or distance(other, inside).max() < 1e-4, (thing.name, other.name)

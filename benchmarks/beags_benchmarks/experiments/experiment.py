@@ -232,11 +232,11 @@ class _Reader:
 
     def samples(self, sample: dict[str, Any]) -> tuple[tuple[str, int], ...]:
         """Take families and seeds out of the table; families alternate, so that the first scenes cover all."""
-        from beags_plugin.sample.families import FAMILIES
+        from beags_plugin.sample import FAMILIES
 
         families, seeds = sample.pop("families", ["tabletop"]), sample.pop("seeds", [0])
-        if not isinstance(families, list) or not families or not set(map(str, families)) <= set(FAMILIES):
-            raise self.wrong(f"sample.families must be a list of {', '.join(FAMILIES)}.")
+        if not isinstance(families, list) or not families or not set(map(str, families)) <= set(FAMILIES.names()):
+            raise self.wrong(f"sample.families must be a list of {', '.join(FAMILIES.names())}.")
         if isinstance(seeds, str):
             if seeds not in SEEDS:
                 raise self.wrong(f"sample.seeds is {seeds!r}: choose one of {', '.join(SEEDS)}, or list whole numbers.")

@@ -19,9 +19,11 @@ _LARGEST = ("peak_memory_mb", "own_memory_mb")
 def object_names(scene: TrialScene) -> list[str]:
     """Return the names of a scene's objects, by ascending id; raises ``UserError`` for data that cannot be read."""
     if (sample := scene.unwritten) is not None:
-        from beags_plugin.sample.families import FAMILIES
+        from beags_plugin.sample import FAMILIES
 
-        return [name for class_id, name in FAMILIES[sample.family].scene(sample.seed).class_names.items() if class_id]
+        return [
+            name for class_id, name in FAMILIES.get(sample.family).scene(sample.seed).class_names.items() if class_id
+        ]
     with quiet():
         outputs = scene.parser().setup().get_dataparser_outputs("train")
     return [name for class_id, name in sorted(outputs.metadata["classes"].items()) if class_id != 0]

@@ -209,10 +209,10 @@ def _shared_damage(config: SampleConfig | None) -> Callable[[np.ndarray, np.ndar
     """Return a function (mask, depth, name) that adds the damage shared by views to an exact mask; None without any."""
     if config is None or not config.shared_damage:
         return None
-    from beags_plugin.sample.families import FAMILIES
+    from beags_plugin.sample import FAMILIES
     from beags_plugin.sample.shared_damage import flawed_mask, plan_flaws
 
-    family = FAMILIES[config.family]
+    family = FAMILIES.get(config.family)
     views = family.views(config.seed, config.width, config.height, config.num_train, config.num_test)
     train = {view.name: view for view in views if view.split == "train"}
     flaws = plan_flaws(family.scene(config.seed), list(train), config.seed, config.shared_damage)

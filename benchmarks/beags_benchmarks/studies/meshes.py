@@ -170,7 +170,7 @@ def measure(config_path: Path, objects: Sequence[str]) -> None:
     from beags_plugin.core.select import select_class
     from beags_plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.objects.export import export_run
-    from beags_plugin.sample.families import FAMILIES
+    from beags_plugin.sample import FAMILIES
 
     EXPORTERS.register("glb-colors", "beags_benchmarks.studies.meshes:VertexColors")
     EXPORTERS.register("glb-closed", "beags_benchmarks.studies.meshes:Closed")
@@ -179,7 +179,7 @@ def measure(config_path: Path, objects: Sequence[str]) -> None:
     things = {}
     if (described := scene.config.data_path / "sample.json").exists():
         sample = json.loads(described.read_text())
-        things = {thing.name: thing for thing in FAMILIES[sample["family"]].scene(sample["seed"]).things}
+        things = {thing.name: thing for thing in FAMILIES.get(sample["family"]).scene(sample["seed"]).things}
     ids = {name: class_id for class_id, name in run.classes.items() if class_id}
     by_variant: dict[str, list[list[float]]] = {label: [] for label in VARIANTS}
     for name in objects or ids:

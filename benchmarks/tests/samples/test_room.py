@@ -5,44 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from open3d.core import Tensor
-from scene_distances import distance
+from scene_distances import assert_touching
 
 from beags_benchmarks.experiments.scenes import SEEDS
+from beags_benchmarks.samples.room import TracedLight, make_room, room_views
 from beags_plugin.core.cameras import viewmat_from_opengl
-from beags_plugin.sample.desk import make_desk
-from beags_plugin.sample.meshes import Mesh, block, extrude, lathe, sweep
-from beags_plugin.sample.room import make_room, room_views
-from beags_plugin.sample.room_light import RoomLight
-from beags_plugin.sample.solids import turned
+from beags_plugin.sample.desk import DeskLight, desk_views, make_desk
 from beags_plugin.sample.tracing import first_hits
-from beags_plugin.sample.views import render_view
+from beags_plugin.sample.views import pixel_directions, render_view
 
 LEANING = {("book", "crate"), ("star", "crate"), ("spoon", "mug"), ("ball", "basket")}
-TOUCHING = {("book", "crate"), ("star", "crate"), ("mug", "crate"), ("vase", "crate"), ("ball", "crate")}
-
-
-def volume(mesh):
-    corners = mesh.vertices[mesh.triangles]
-    return np.linalg.det(corners).sum() / 6.0
-
-
-def test_meshes_are_closed_and_face_outwards():
-    turn = np.linspace(0.0, np.pi, 33)
-    square = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-    ball = np.stack([np.sin(turn), -np.cos(turn)], axis=1)
-    ball[[0, -1], 0] = 0.0
-    for part, expected, within in [
-        (block(0.5, 1.0, -1.0, 2.0), 6.0, 1e-12),
-        (extrude(square, 0.5 * square, 0.0, 1.0), 3.0, 1e-12),
-        (lathe(ball), 4.0 / 3.0 * np.pi, 0.02),
-        (sweep(np.stack([3.0 * turn, 0.0 * turn], axis=1), 0.1, 64), 0.03 * np.pi**2, 2e-3),
-    ]:
-        mesh = Mesh(part)
-        assert volume(mesh) == pytest.approx(expected, rel=within)
-        _, vertex = np.unique(mesh.vertices.round(9), axis=0, return_inverse=True)
-        ends = vertex.ravel()[mesh.triangles[:, [0, 1, 1, 2, 2, 0]]].reshape(-1, 2)
-        assert sorted(map(tuple, ends)) == sorted(map(tuple, ends[:, ::-1]))  # each edge once in either direction
 
 
 @pytest.fixture(scope="module", params=SEEDS["choosing"])
@@ -50,28 +22,8 @@ def room(request):
     return request.param, make_room(request.param)
 
 
-@pytest.mark.parametrize("seed", SEEDS["choosing"])
-@pytest.mark.parametrize(("make", "touching"), [(make_room, LEANING), (make_desk, TOUCHING)])
-def test_things_touch_where_they_should_and_nowhere_run_into_one_another(make, touching, seed):
-    made = make(seed)
-    names = made.class_names
-    for contact in made.contacts:
-        for class_id in (contact.first, contact.second):
-            off = distance(made.things[class_id - 1], contact.point[None])[0] if class_id else contact.point[2]
-            assert abs(off) < 1e-9
-    assert {(names[c.first], names[c.second]) for c in made.contacts if c.second} == touching
-    assert set(names) - {0} == {c.first for c in made.contacts}
-    generator = np.random.default_rng(0)
-    for thing in made.things:
-        corners = thing.solid.vertices[thing.solid.triangles]
-        weights = generator.dirichlet([1.0] * 3, len(corners))
-        points = turned(np.einsum("tc,tck->tk", weights, corners), thing.rotation.T) + thing.position
-        assert points[:, 2].min() > -1e-9 and np.abs(made.shell.to_local(points)[:, :2]).max() < 3.5
-        for other in made.things:
-            if other is not thing:
-                local = Tensor(other.to_local(points).astype(np.float32))
-                inside = points[other.solid.caster.compute_occupancy(local, nsamples=3).numpy() > 0]
-                assert len(inside) == 0 or distance(other, inside).max() < 1e-4, (thing.name, other.name)
+def test_things_touch_where_they_should_and_nowhere_run_into_one_another(room):
+    assert_touching(room[1], LEANING)
 
 
 def rasterized(view, things):
@@ -101,7 +53,7 @@ def rasterized(view, things):
 
 def test_masks_silhouettes_and_depth_are_those_of_projected_triangles(room):
     seed, made = room
-    light = RoomLight(made, 4, 4)
+    light = TracedLight(made, 4, 4)
     for view in room_views(seed, 96, 72, 2, 1)[::2]:
         picture = render_view(made, light, view, 1)
         depth = rasterized(view, made.things)
@@ -148,6 +100,21 @@ def shown(scene, view, points):
     seen = np.zeros(len(points), dtype=bool)
     seen[inside] = hits.t > 0.995
     return seen
+
+
+def test_light_that_the_desk_bakes_is_that_of_the_room():
+    made = make_desk(0)
+    light, direct, views = DeskLight(made), TracedLight(made), desk_views(0, 96, 72, 5, 1)
+    for view in views[::3]:
+        directions = pixel_directions(view)
+        hits, _ = first_hits(made, view.center, directions)
+        points = view.center + hits.t[:, None] * directions
+        baked = light.colours(points, hits.surface, directions, view.center)
+        # Each of four rays sees by its own share of the lamp.
+        place, part, way = (np.repeat(each, 4, axis=0) for each in (points, hits.surface, directions))
+        expected = direct.colours(place, part, way, view.center).reshape(-1, 4, 3).mean(axis=1)
+        assert np.median(np.abs(baked - expected)) < 0.01 * np.median(expected)
+        assert abs(baked.mean() / expected.mean() - 1.0) < 0.01
 
 
 def test_rooms_of_different_seeds_differ():
