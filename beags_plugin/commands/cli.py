@@ -19,6 +19,7 @@ from beags_plugin.commands.answers import CONSOLE, write_json
 from beags_plugin.commands.masks import Masks
 from beags_plugin.commands.of_runs import Clean, Eval, Export, Extract, Render
 from beags_plugin.commands.process import Process
+from beags_plugin.commands.sample import Sample
 from beags_plugin.commands.starting import check_arguments, run_config, starting
 from beags_plugin.system.errors import UserError, refused, silence_libraries
 from beags_plugin.system.output_option import OUTPUT
@@ -120,47 +121,6 @@ class View:
             from beags_plugin.plugin.viewer.serve import serve
         errand = None if self.save_to is None else Errand(self.save_to.absolute(), self.expect)
         serve(run_config(self.run_folder), self.data, self.port, errand)
-
-
-@dataclass
-class Sample:
-    """Generate a scene with exact ground truth: photos, damaged masks, silhouettes, depth, objects removed."""
-
-    output: Annotated[Path, OUTPUT] = Path("outputs/sample")
-    """Folder to write."""
-    seed: int = 0
-    """Another seed gives another arrangement."""
-    width: int = 256
-    """Pixels."""
-    height: int = 192
-    """Pixels."""
-    degradation: str = "mild"
-    """How masks are damaged: none, mild or strong, or any degree from 0 on (1 is mild, 2 strong)."""
-    views: int = 60
-    """Views to train on; 12 more are held out."""
-    family: str = "tabletop"
-    """tabletop: plain solids that touch. desk: textured objects close together in a furnished room. Both are seen from
-    all sides. Of benchmarks/: turntable, where the solids turn and the room stands; room, where such objects lean on
-    and stand in one another, seen from one side."""
-    exposure: float = 0.0
-    """The largest difference of a photo's exposure from the mean, in stops (EV), at most 6."""
-    white_balance: float = 0.0
-    """The largest difference of a photo's red from the mean, and of its blue the other way, in stops, at most 6."""
-    moved: int = 0
-    """Views to train on that show something of the background which stands elsewhere in each, and in no other view."""
-    shared_damage: float = 0.0
-    """Share of the masks to train on, 0 to 1, in which half of the objects take in what they stand on, or lack a foot,
-    alike in all of them."""
-
-    def run(self) -> None:
-        with starting(self):
-            from beags_plugin.sample.writer import make_sample
-        make_sample(
-            self.output, self.seed, self.width, self.height, self.degradation, self.views, family=self.family,
-            exposure=self.exposure, white_balance=self.white_balance, moved=self.moved,
-            shared_damage=self.shared_damage,
-        )  # fmt: skip
-        CONSOLE.print(f"sample: {self.output}")
 
 
 @dataclass

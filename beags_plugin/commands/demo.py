@@ -51,7 +51,7 @@ def run_demo(
     from beags_plugin.commands.scene_setup import MadeScene, made_scene, name_of
     from beags_plugin.data.layout import read_dataset
     from beags_plugin.data.quick import quick_downscale
-    from beags_plugin.sample.writer import make_sample
+    from beags_plugin.sample.writer import SampleConfig, make_sample
 
     again = _again(data, output, preset, downscale, objects)
     preset = preset or (PRESET if data is None else PRESET_OF_PHOTOS)
@@ -67,7 +67,7 @@ def run_demo(
         output = output or Path("outputs/demo")
         scene = MadeScene(output / "sample")
         with timed(seconds, "sample"):
-            make_sample(scene.data, seed, *SIZE, "mild", views=30, num_test=6, num_points=6000, family="desk")
+            make_sample(scene.data, SampleConfig(seed, *SIZE, 30, 6, num_points=6000, family="desk"))
         downscale = downscale or DOWNSCALE
     else:
         output = output or Path("outputs") / name_of(data)

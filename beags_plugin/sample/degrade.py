@@ -6,13 +6,12 @@ The seed and the view's name decide everything, so one view's mask does not depe
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
-from beags_plugin.sample.lots import lowest_lots, view_generator
 from beags_plugin.sample.textures import Noise
 from beags_plugin.system.errors import UserError, check_choice
 
@@ -31,42 +30,35 @@ class Degradation:
     swapped: float = 0.0
 
 
-PRESETS = {  # The order is that of their degrees: 0, 1, 2.
+PRESETS = {
     "none": Degradation(),
     "mild": Degradation(rim=0.004, dropped=0.05, swapped=0.04),
     "strong": Degradation(rim=0.009, dropped=0.2, swapped=0.12),
 }
 
 
-def degradation_of_degree(degree: float) -> Degradation:
-    """Interpolate the presets linearly: degree 0 is "none", 1 "mild", 2 "strong"; above 2, extrapolate.
-
-    Raises ``UserError`` for a degree below 0, or so high that a share would exceed 1.
-    """
-    if not 0.0 <= degree < math.inf:
-        raise UserError(f"the degree of mask degradation is {degree}: give a number from 0 on (1 is mild, 2 strong).")
-    steps = list(PRESETS.values())
-    first = min(int(degree), len(steps) - 2)
-    low, high, share = steps[first], steps[first + 1], degree - first
-    values = (
-        (1.0 - share) * getattr(low, name) + share * getattr(high, name) for name in ("rim", "dropped", "swapped")
-    )
-    return resolve_degradation(Degradation(*values))
-
-
 def resolve_degradation(degradation: str | Degradation) -> Degradation:
-    """Return the degradation of a preset's name or of a degree as text, or a custom one; check its values."""
+    """Return the degradation of a preset's name, or a custom one; check its values."""
     if isinstance(degradation, str):
-        with suppress(ValueError):
-            return degradation_of_degree(float(degradation))
-        more = ", or a degree from 0 on (1 is mild, 2 strong)"
-        check_choice(degradation, PRESETS, "mask degradation", more=more)
+        check_choice(degradation, PRESETS, "mask degradation")
         return PRESETS[degradation]
     for name in ("rim", "dropped", "swapped"):
         value = getattr(degradation, name)
         if not 0.0 <= value <= 1.0:
             raise UserError(f"the mask degradation's {name} is {value}: give a number from 0 to 1.")
     return degradation
+
+
+def view_generator(seed: int, view: str, purpose: int) -> np.random.Generator:
+    """Return the generator of a view's random numbers for one purpose."""
+    # Python's own string hash differs between runs; crc32 does not.
+    return np.random.default_rng([seed, purpose, zlib.crc32(view.encode())])
+
+
+def lowest_lots(names: Sequence[str], seed: int, count: int, purpose: int) -> set[str]:
+    """Return the ``count`` names whose random number is lowest."""
+    lots = sorted((float(view_generator(seed, name, purpose).random()), name) for name in names)
+    return {name for _, name in lots[:count]}
 
 
 def dropped_views(names: Sequence[str], seed: int, fraction: float) -> set[str]:

@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,11 @@ import numpy as np
 
 from beags_plugin.sample import FAMILIES
 from beags_plugin.sample.degrade import Degradation, degrade_mask, dropped_views, resolve_degradation
-from beags_plugin.sample.exposure import LARGEST_STOPS
+from beags_plugin.sample.family import Family
 from beags_plugin.sample.points import SeedPoints, find_tracks, seed_points
+from beags_plugin.sample.scene import Scene
 from beags_plugin.sample.seen import Photo, seen_part, shown_points, visible_surface, well_seen
-from beags_plugin.sample.shared_damage import flawed_mask, plan_flaws
-from beags_plugin.sample.shots import Shot, plan_shots, taken
+from beags_plugin.sample.shots import Shot, taken
 from beags_plugin.sample.views import Picture, View, render_pixels, render_removed, surface_without
 from beags_plugin.system.errors import UserError, unwritable, writing
 from beags_plugin.system.progress import progress_bar
@@ -31,25 +31,24 @@ LARGEST_SIDE = 8192  # pixels
 POINT_NOISE = 0.03
 """Noise of seed points, world units: two to three pixels at 256 x 192, as in a hand-held capture."""
 SAMPLE_FILE, TRACKS_FILE = "sample.json", "seed_tracks.json"
+ALIKE = {"exposure": 0.0, "white_balance": 0.0, "moved": 0, "shared_damage": 0.0}
+"""Entries of sample.json that tell what photos and masks of benchmarks' samples have in addition: nothing."""
+Flawed = Callable[[np.ndarray, np.ndarray, View], np.ndarray]
+"""From the exact mask and depth [H, W] of a training photo to its mask."""
 
 
 @dataclass(frozen=True)
 class SampleConfig:
     """Options that decide every byte of the sample.
 
-    family: family of scenes: "tabletop" (solids on the ground, seen from all sides), "turntable" (the same views of the
-        same solids, which turn while ground and curtain stand still), "room" (a closed room, see ``room``) or "desk"
-        (textured things that touch in such a room, see ``desk``).
+    family: "tabletop" (solids on the ground, seen from all sides), "desk" (textured things that touch in a room), or
+        one of another package.
     seed: decides arrangement, sizes, colours, textures, light, camera jitter, mask degradation.
     width, height: pixels. num_train, num_test: numbers of views.
-    degradation: errors of the train masks: "none", "mild", "strong", a degree as text ("1.5"), or a ``Degradation``.
+    degradation: errors of the train masks: "none", "mild", "strong", or a ``Degradation``.
     num_points: seed points. antialias: rays per pixel, along each axis, for the images.
-    exposure, white_balance: stops, the largest differences of a photo from the mean (``exposure.photo_gains``); with 0
-        for both, all photos are alike.
-    moved: number of training photos in which something of the background stands before the camera, in another place in
-        each; no other photo shows it.
-    shared_damage: share of the training masks in which half of the objects have the same error each: the mask includes
-        the surface below the object, or lacks its foot on one side (``plan_flaws``); ``degradation`` is applied after.
+
+    Its photos are alike. A subclass may take others, by ``shots``, and make masks wrong, by ``damage`` and ``flaws``.
     """
 
     seed: int = 0
@@ -61,39 +60,37 @@ class SampleConfig:
     num_points: int = 2000
     antialias: int = 2
     family: str = "tabletop"
-    exposure: float = 0.0
-    white_balance: float = 0.0
-    moved: int = 0
-    shared_damage: float = 0.0
 
     def check(self) -> None:
         """Raise ``UserError`` for a value that makes no scene."""
-        least = {"seed": 0, "width": 16, "height": 16, "num_train": 1, "num_test": 1, "num_points": 1, "antialias": 1,
-                 "moved": 0}  # fmt: skip
+        least = {"seed": 0, "width": 16, "height": 16, "num_train": 1, "num_test": 1, "num_points": 1, "antialias": 1}
         for name, low in least.items():
             if getattr(self, name) < low:
                 raise UserError(f"the sample's {name} is {getattr(self, name)}: give at least {low}.")
         for name in ("width", "height"):
             if getattr(self, name) > LARGEST_SIDE:
                 raise UserError(f"the sample's {name} is {getattr(self, name)}: give at most {LARGEST_SIDE}.")
-        for name in ("exposure", "white_balance"):
-            if not 0.0 <= getattr(self, name) <= LARGEST_STOPS:
-                raise UserError(
-                    f"the sample's {name} is {getattr(self, name)}: give the largest difference of a photo from the "
-                    f"mean in stops, from 0 to {LARGEST_STOPS:g}."
-                )
-        if self.moved > self.num_train:
-            raise UserError(
-                f"the sample's moved is {self.moved}: give at most {self.num_train}, the number of training photos."
-            )
-        if not 0.0 <= self.shared_damage <= 1.0:
-            raise UserError(f"the sample's shared_damage is {self.shared_damage}: give a share of views from 0 to 1.")
         FAMILIES.check(self.family)
-        resolve_degradation(self.degradation)
+        self.damage()
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of sample.json, with presets spelled out, so that a changed preset is another sample."""
-        return {"version": VERSION, **asdict(self), "degradation": asdict(resolve_degradation(self.degradation))}
+        entries = {"version": VERSION, **asdict(self), "degradation": asdict(self.damage())}
+        return {**entries, **{name: value for name, value in ALIKE.items() if name not in entries}}
+
+    def damage(self) -> Degradation:
+        """Return the errors that each train mask has for itself; raises ``UserError`` for an unknown name."""
+        return resolve_degradation(self.degradation)
+
+    def shots(self, family: Family, views: list[View]) -> list[Shot]:
+        """Return the photo to take of each view."""
+        scene = family.scene(self.seed)
+        light = family.light(scene)
+        return [Shot(view, scene, scene, light, light) for view in views]
+
+    def flaws(self, scene: Scene, train: Sequence[str]) -> Flawed:
+        """Return what gives exact masks the errors that the training photos, by name, share: here there are none."""
+        return lambda labels, depth, view: labels
 
 
 def is_sample(folder: Path, config: SampleConfig) -> bool:
@@ -160,10 +157,10 @@ def write_sample(
 def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], None] | None) -> None:
     family = FAMILIES.get(config.family)
     views = family.views(config.seed, config.width, config.height, config.num_train, config.num_test)
-    shots = plan_shots(family, config.seed, views, config.exposure, config.white_balance, config.moved)
-    degradation = resolve_degradation(config.degradation)
+    shots = config.shots(family, views)
+    degradation = config.damage()
     train = [view.name for view in views if view.split == "train"]
-    flaws = plan_flaws(shots[0].still, train, config.seed, config.shared_damage)
+    flawed = config.flaws(shots[0].still, train)
     dropped = dropped_views(train, config.seed, degradation.dropped)
     ends = [config.num_points * i // len(train) for i in range(len(train) + 1)]
     shares = {name: end - first for name, first, end in zip(train, ends[:-1], ends[1:], strict=True)}
@@ -191,7 +188,7 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
             photos.append(Photo(view, scene, picture.depth))
             for surface, part in zip(surfaces, visible_surface(view, picture), strict=True):
                 surface.append(part)
-            mask = flawed_mask(mask, picture.depth, view, flaws)
+            mask = flawed(mask, picture.depth, view)
             mask = degrade_mask(mask, len(names), degradation, config.seed, view.name)
             # Each view has a generator, so that its points do not depend on other pictures.
             generator = np.random.default_rng([config.seed, 6, done])
@@ -277,13 +274,7 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def make_sample(
-    folder: Path, seed: int, width: int, height: int, degradation: str, views: int = 60, **options: Any
-) -> None:
-    """Generate the sample with ``views`` training views in ``folder``, unless ``folder`` holds it already.
-
-    options: other options of ``SampleConfig``.
-    """
-    config = SampleConfig(seed, width, height, views, degradation=degradation, **options)
+def make_sample(folder: Path, config: SampleConfig) -> None:
+    """Write a sample into ``folder`` as ``write_sample`` does, and show the progress."""
     with progress_bar("Tracing the sample") as progress:
         write_sample(folder, config, progress)

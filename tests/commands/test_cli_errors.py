@@ -33,10 +33,10 @@ SENTENCES = {
     "beags-tiny.",
     # sample
     "sample --output {tmp}/s --degradation heavy": "there is no mask degradation 'heavy': choose one of none, mild, "
-    "strong, or a degree from 0 on (1 is mild, 2 strong).",
+    "strong.",
     "sample --output {tmp}/s --width 0": "the sample's width is 0: give at least 16.",
-    "sample --output {tmp}/s --white-balance 7": "the sample's white_balance is 7.0: give the largest difference of a "
-    "photo from the mean in stops, from 0 to 6.",
+    "bench sample --output {tmp}/s --white-balance 7": "the sample's white_balance is 7.0: give the largest "
+    "difference of a photo from the mean in stops, from 0 to 6.",
     "sample --output {tmp}/file/s": "{tmp}/file/s cannot be written (File exists): choose another place.",
     "sample --output {tmp}/lab": "{tmp}/lab exists and is no sample scene: choose another folder or empty it.",
     # resume

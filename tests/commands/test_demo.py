@@ -19,7 +19,6 @@ from beags_plugin.commands.demo_training import STAMP, trained
 from beags_plugin.data.quick import QUICK_PIXELS, quick_downscale
 from beags_plugin.plugin.options.config import base_config
 from beags_plugin.sample import writer
-from beags_plugin.sample.writer import SampleConfig
 from beags_plugin.system.errors import UserError
 
 
@@ -123,8 +122,8 @@ def test_a_demo_that_was_killed_goes_on(tmp_path, monkeypatch):
 def test_the_generated_scene_is_photos_of_a_desk_trained_on_with_close_ups(tmp_path, monkeypatch):
     made, commands = [], []
 
-    def make_sample(folder, seed, width, height, degradation, views, **options):
-        made.append(SampleConfig(seed, width, height, views, degradation=degradation, **options))
+    def make_sample(folder, config):
+        made.append(config)
         write_scene(folder)
 
     monkeypatch.setattr(writer, "make_sample", make_sample)

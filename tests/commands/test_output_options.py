@@ -17,7 +17,7 @@ from beags_plugin.commands import cli, masks
 WORDS = [
     *([command.__name__.lower()] for command in typing.get_args(cli.Command) if command.__name__ != "Masks"),
     *(["masks", action.__name__.lower()] for action in (masks.Check, masks.Make, masks.Reproject, masks.Truth)),
-    *(["bench", name] for name in (next(iter(SHIPPED)), "file", "paper", "captures")),
+    *(["bench", name] for name in (next(iter(SHIPPED)), "file", "paper", "captures", "sample")),
 ]
 
 

@@ -9,15 +9,13 @@ import shutil
 import numpy as np
 import pytest
 from PIL import Image
+from sample_checks import TINY, grey, points_of, splits
 from scene_distances import distance, from_background
 from scipy.ndimage import grey_dilation
 
 from beags_plugin.sample import FAMILIES, writer
 from beags_plugin.sample.writer import SampleConfig, is_sample, write_sample
 from beags_plugin.system.errors import UserError
-
-TINY = SampleConfig(seed=3, width=24, height=16, num_train=5, num_test=2, num_points=101, degradation="strong")
-
 
 CLASSES = {"tabletop": 8, "desk": 7}  # number of classes, with the background
 
@@ -30,10 +28,6 @@ def config(request):
 @pytest.fixture(scope="module")
 def folder(config, tmp_path_factory):
     return write_sample(tmp_path_factory.mktemp("sample") / "tiny", config)
-
-
-def grey(path):
-    return np.array(Image.open(path))
 
 
 def test_folder_layout(folder, config):
@@ -93,6 +87,16 @@ def test_seed_points_lie_on_surfaces(folder, config):
     assert np.min(near, axis=0).max() < 6 * writer.POINT_NOISE
     assert 0.3 < np.mean(np.min(near[1:], axis=0) < 6 * writer.POINT_NOISE) <= 1.0
     assert records["c"].std() > 5
+
+
+def test_written_tracks_belong_to_the_points(folder):
+    tracks = json.loads((folder / "seed_tracks.json").read_text())
+    assert tracks["photos"] == list(next(splits(folder)))
+    assert len(tracks["points"]) == len(points_of(folder)) == TINY.num_points
+    ends = [TINY.num_points * i // 5 for i in range(6)]
+    for photo in range(5):
+        for shown in tracks["points"][ends[photo] : ends[photo + 1]]:
+            assert photo in shown and shown == sorted(set(shown)) and set(shown) <= set(range(5))
 
 
 def test_nerfstudio_reads_it(folder):

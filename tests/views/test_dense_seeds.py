@@ -11,16 +11,17 @@ import torch
 
 pytest.importorskip("nerfstudio")
 
+from beags_benchmarks.samples.config import VariedSample
 from beags_plugin.plugin.views import datamanager as managing
 from beags_plugin.plugin.views.datamanager import BeagsDataManager, BeagsDataManagerConfig
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.posing.dense_points import dense_points
 from beags_plugin.posing.plane_sweep import PLANES, PosedPhoto, swept
-from beags_plugin.sample.writer import SampleConfig, write_sample
+from beags_plugin.sample.writer import write_sample
 from beags_plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.views.views import in_unit_range
 
-SAMPLE = SampleConfig(width=120, height=90, num_train=16, num_test=2, num_points=300, exposure=1.0)
+SAMPLE = VariedSample(width=120, height=90, num_train=16, num_test=2, num_points=300, exposure=1.0)
 
 
 @pytest.fixture(scope="module")

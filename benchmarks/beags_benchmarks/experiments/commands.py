@@ -11,6 +11,7 @@ import tyro
 from beags_benchmarks.experiments.captures.options import CapturesOptions
 from beags_benchmarks.experiments.options import ExperimentOptions
 from beags_benchmarks.experiments.paper.options import PaperOptions
+from beags_benchmarks.samples.command import BenchSample
 
 
 @dataclass
@@ -73,7 +74,7 @@ SHIPPED = {
 """Commands by experiment, with the sentence of their help."""
 
 if TYPE_CHECKING:
-    Measurement = ShippedExperiment | ExperimentFile | PaperBench | CapturesBench
+    Measurement = ShippedExperiment | ExperimentFile | PaperBench | CapturesBench | BenchSample
 else:
     Measurement = Union[  # noqa: UP007  (of a tuple)
         tuple(
@@ -87,6 +88,7 @@ else:
             Annotated[ExperimentFile, tyro.conf.subcommand("file")],
             Annotated[PaperBench, tyro.conf.subcommand("paper")],
             Annotated[CapturesBench, tyro.conf.subcommand("captures")],
+            Annotated[BenchSample, tyro.conf.subcommand("sample")],
         )
     ]
 

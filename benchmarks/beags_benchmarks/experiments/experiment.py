@@ -65,7 +65,7 @@ class PaperFigures:
 class Experiment:
     """The content of ``files/<name>.toml``.
 
-    samples, sample: family and seed of the generated scenes, and other options of ``SampleConfig``. of_seed: options
+    samples, sample: family and seed of the generated scenes, and other options of ``VariedSample``. of_seed: options
     for scenes of one seed only. seeds: seeds of the training. reference: the variant with which the others' errors are
     compared. confidence, objects: whether to plot the masks' confidence, and the largest objects by each variant.
     relative_to_pixels: sweeps whose axis is also given per million training pixels.
@@ -251,16 +251,16 @@ class _Reader:
         return {int(seed): options for seed, options in tables.items()}
 
     def checked_sample(self, options: dict[str, Any]) -> dict[str, Any]:
-        from beags_plugin.sample.writer import SampleConfig
+        from beags_benchmarks.samples.config import VariedSample
 
         try:
-            SampleConfig(**options, family="tabletop", seed=0).check()
+            VariedSample(**options, family="tabletop", seed=0).check()
         except (TypeError, UserError) as error:
             raise self.wrong(f"sample: {error}") from None
         return options
 
     def degree(self, value: Any) -> float:
-        from beags_plugin.sample.degrade import degradation_of_degree
+        from beags_benchmarks.samples.damage import degradation_of_degree
 
         if not _is_number(value):
             raise self.wrong(f"damage is {value!r}: give a number (1 is mild, 2 strong).")

@@ -24,8 +24,8 @@ from beags_plugin.system.whole_files import write_text_atomically
 if TYPE_CHECKING:
     from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
+    from beags_benchmarks.samples.config import VariedSample
     from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
-    from beags_plugin.sample.writer import SampleConfig
 
 SEEDS = {"choosing": (0, 1, 2), "reporting": (100, 101, 102, 103, 104)}
 """Seeds of generated scenes; results on the seeds for reporting must not decide on choices."""
@@ -51,11 +51,11 @@ class TrialScene:
     digest: str
     seed: int = 0
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
-    sample: SampleConfig | None = field(default=None, compare=False)
+    sample: VariedSample | None = field(default=None, compare=False)
     photos: TrialScene | None = field(default=None, compare=False)
 
     @property
-    def unwritten(self) -> SampleConfig | None:
+    def unwritten(self) -> VariedSample | None:
         """Return the config of a generated scene that is not on disk; None for others."""
         return None if self.data.exists() else self.sample
 
@@ -97,9 +97,10 @@ def parser_options(plain: Mapping[str, Any]) -> dict[str, Any]:
 
 def sample_scene(folder: Path, family: str, seed: int, options: Mapping[str, Any], write: bool = True) -> TrialScene:
     """Return the generated scene of that family and seed; write it into ``folder`` unless it is there."""
-    from beags_plugin.sample.writer import SampleConfig, is_sample, write_sample
+    from beags_benchmarks.samples.config import VariedSample
+    from beags_plugin.sample.writer import is_sample, write_sample
 
-    config = SampleConfig(**{**options, "family": family, "seed": seed})
+    config = VariedSample(**{**options, "family": family, "seed": seed})
     digest = value_digest(config.as_dict())
     target = folder / f"{family}-{seed}-{digest[:8]}"
     config.check()
@@ -135,10 +136,11 @@ def damaged_masks(scene: TrialScene, degree: float, folder: Path, write: bool = 
     first, if the experiment generates it. Masks of held-out views stay unchanged. An existing folder of the same damage
     is reused. Without ``write`` only the folder's name is returned.
     """
-    from beags_plugin.sample import degrade, shared_damage
+    from beags_benchmarks.samples import damage
+    from beags_plugin.sample import degrade
 
-    degradation = degrade.degradation_of_degree(degree)
-    code = [Path(str(file)).read_text("utf8") for file in (degrade.__file__, shared_damage.__file__, __file__)]
+    degradation = damage.degradation_of_degree(degree)
+    code = [Path(str(file)).read_text("utf8") for file in (degrade.__file__, damage.__file__, __file__)]
     target = folder / f"masks-{value_digest([scene.digest, scene.seed, degree, code])[:12]}"
     if not write or _is_whole(target):
         return target
@@ -205,18 +207,17 @@ def class_masks(scene: TrialScene, count: int, folder: Path, write: bool = True)
     return target
 
 
-def _shared_damage(config: SampleConfig | None) -> Callable[[np.ndarray, np.ndarray, str], np.ndarray] | None:
+def _shared_damage(config: VariedSample | None) -> Callable[[np.ndarray, np.ndarray, str], np.ndarray] | None:
     """Return a function (mask, depth, name) that adds the damage shared by views to an exact mask; None without any."""
     if config is None or not config.shared_damage:
         return None
     from beags_plugin.sample import FAMILIES
-    from beags_plugin.sample.shared_damage import flawed_mask, plan_flaws
 
     family = FAMILIES.get(config.family)
     views = family.views(config.seed, config.width, config.height, config.num_train, config.num_test)
     train = {view.name: view for view in views if view.split == "train"}
-    flaws = plan_flaws(family.scene(config.seed), list(train), config.seed, config.shared_damage)
-    return lambda labels, depth, name: flawed_mask(labels, depth, train[name], flaws)
+    flawed = config.flaws(family.scene(config.seed), list(train))
+    return lambda labels, depth, name: flawed(labels, depth, train[name])
 
 
 def _is_whole(target: Path) -> bool:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from beags_plugin.sample.arrangement import make_still, turn_z
+from beags_plugin.sample.arrangement import make_still
 from beags_plugin.sample.family import Family
 from beags_plugin.sample.lighting import Light
-from beags_plugin.sample.solids import turned
+from beags_plugin.sample.solids import turn_z, turned
 from beags_plugin.sample.views import make_views
 
 

@@ -26,6 +26,8 @@ from resumed_runs import (
     short_config,
 )
 
+from beags_benchmarks.samples.config import VariedSample
+from beags_benchmarks.samples.exposure import photo_gains as true_gains
 from beags_plugin.core.color_fit import apply_affine
 from beags_plugin.core.exposure import Exposures
 from beags_plugin.objects.evaluate import evaluate_run
@@ -40,14 +42,13 @@ from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
 from beags_plugin.runs.picked import write_picked
 from beags_plugin.runs.read import read_run
 from beags_plugin.runs.run import Run
-from beags_plugin.sample.exposure import photo_gains as true_gains
-from beags_plugin.sample.writer import SampleConfig, write_sample
+from beags_plugin.sample.writer import write_sample
 from beags_plugin.surfaces.color import srgb_from_linear
 from beags_plugin.surfaces.frames import Frame
 from beags_plugin.system.errors import UserError
 from beags_plugin.views.photo_files import PhotoFiles
 
-SAMPLE = SampleConfig(width=56, height=42, num_train=10, num_test=2, num_points=600)
+SAMPLE = VariedSample(width=56, height=42, num_train=10, num_test=2, num_points=600)
 EXPOSED = {"exposure": 1.5}
 
 

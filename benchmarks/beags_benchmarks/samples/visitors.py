@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from beags_plugin.sample.arrangement import Still
-from beags_plugin.sample.lots import view_generator
+from beags_plugin.sample.degrade import view_generator
 from beags_plugin.sample.meshes import Mesh, lathe
 from beags_plugin.sample.prints import Paint, around, stripes
 from beags_plugin.sample.room import Room

@@ -6,19 +6,19 @@ import dataclasses
 
 import numpy as np
 import pytest
+from sample_checks import TINY, files, grey, splits
 from scene_distances import distance
 from scipy.ndimage import maximum_filter
 from scipy.spatial.distance import cdist
-from test_shots import files, splits
-from test_writer import TINY, grey
 
+from beags_benchmarks.samples.config import VariedSample
+from beags_benchmarks.samples.damage import Beyond, Near, flawed_mask, plan_flaws
 from beags_plugin.sample import FAMILIES
 from beags_plugin.sample.degrade import PRESETS, degrade_mask
 from beags_plugin.sample.seen import Photo, shown_in
-from beags_plugin.sample.shared_damage import Beyond, Near, flawed_mask, plan_flaws
 from beags_plugin.sample.tracing import first_hits
 from beags_plugin.sample.views import pixel_directions
-from beags_plugin.sample.writer import SampleConfig, write_sample
+from beags_plugin.sample.writer import write_sample
 from beags_plugin.system.errors import UserError
 
 SEED, SHARE = 2, 0.6
@@ -153,7 +153,7 @@ def test_the_seed_decides(family):
 
 
 def test_a_sample_has_it_in_training_masks_alone(family, tmp_path):
-    config = dataclasses.replace(TINY, width=48, height=32, family=family, degradation="none")
+    config = VariedSample(**{**vars(TINY), "width": 48, "height": 32, "family": family, "degradation": "none"})
     plain = write_sample(tmp_path / "plain", config)
     shared = write_sample(tmp_path / "shared", dataclasses.replace(config, shared_damage=SHARE))
     mild = write_sample(tmp_path / "mild", dataclasses.replace(config, shared_damage=SHARE, degradation="mild"))
@@ -176,5 +176,5 @@ def test_a_sample_has_it_in_training_masks_alone(family, tmp_path):
 @pytest.mark.parametrize("wrong", [-0.1, 1.5, float("nan")])
 def test_a_share_is_from_0_to_1(tmp_path, wrong):
     with pytest.raises(UserError, match=f"the sample's shared_damage is {wrong}: give a share of views from 0 to 1"):
-        write_sample(tmp_path / "s", SampleConfig(shared_damage=wrong))
+        write_sample(tmp_path / "s", VariedSample(shared_damage=wrong))
     assert list(tmp_path.iterdir()) == []

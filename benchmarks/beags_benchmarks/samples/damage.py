@@ -1,10 +1,11 @@
-"""Mask errors that most views share, as segmenters make them: a plinth is included, or a foot is left out.
+"""Mask errors of any degree, and those that most views share: a plinth is included, or a foot is left out.
 
-Each flaw is a region of space, so that views agree on it. Seed and names decide everything.
+Each flaw that views share is a region of space, so that they agree on it. Seed and names decide everything.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,11 +13,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
 
-from beags_plugin.sample.lots import lowest_lots
+from beags_plugin.sample.degrade import PRESETS, Degradation, lowest_lots, resolve_degradation
 from beags_plugin.sample.scene import Scene, Thing
 from beags_plugin.sample.seen import surface_points
 from beags_plugin.sample.solids import dot, turned
 from beags_plugin.sample.views import View
+from beags_plugin.system.errors import UserError
 
 CHORDS = 4096  # rays that sample the surface of an object
 FOOT = 0.15  # height of an object's foot over the object's height
@@ -24,6 +26,22 @@ TAKEN_IN = 0.25, 0.40
 """Range of the included region's reach beyond the foot, over half of the object's width or height, if larger."""
 LEFT_OUT = 0.06, 0.14
 """Range of the share of an object's surface that is left out."""
+
+
+def degradation_of_degree(degree: float) -> Degradation:
+    """Interpolate the presets linearly: degree 0 is "none", 1 "mild", 2 "strong"; above 2, extrapolate.
+
+    Raises ``UserError`` for a degree below 0, or so high that a share would exceed 1.
+    """
+    if not 0.0 <= degree < math.inf:
+        raise UserError(f"the degree of mask degradation is {degree}: give a number from 0 on (1 is mild, 2 strong).")
+    steps = [PRESETS[name] for name in ("none", "mild", "strong")]
+    first = min(int(degree), len(steps) - 2)
+    low, high, share = steps[first], steps[first + 1], degree - first
+    values = (
+        (1.0 - share) * getattr(low, name) + share * getattr(high, name) for name in ("rim", "dropped", "swapped")
+    )
+    return resolve_degradation(Degradation(*values))
 
 
 @dataclass(frozen=True)

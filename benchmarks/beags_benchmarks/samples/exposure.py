@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beags_plugin.sample.lots import view_generator
+from beags_plugin.sample.degrade import view_generator
 from beags_plugin.sample.scene import Lighting
 
 LARGEST_STOPS = 6.0  # Photos beyond it are black or saturated.
