@@ -32,8 +32,8 @@ class Sample:
     """Views to train on; 12 more are held out."""
     family: str = "tabletop"
     """tabletop: plain solids that touch. desk: textured objects that touch in a furnished room. Both are seen from all
-    sides. Of benchmarks/: turntable, the tabletop's solids turn and the room stands; room, textured objects that lean
-    on and stand in one another, seen from one side."""
+    sides. benchmarks/ adds turntable (the tabletop's solids turn while the room stands still) and room (textured
+    objects that lean on and stand in one another, seen from one side)."""
 
     def config(self) -> SampleConfig:
         """Return the config of the sample to write."""

@@ -165,7 +165,7 @@ def _scene_of_objects(
 def _all_masks(photos: Path, labels: Path, name: str, chosen: ChosenSource, mended: Path | None) -> None:
     """Make masks of all photos, because held-out ones need poses too; masks in ``mended`` replace them.
 
-    Masks of an earlier call are replaced by newer ones alone: the user may have mended either.
+    Only a newer file replaces a mask of an earlier call, because the user may have mended either.
     """
 
     def digest() -> str:

@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 class ReprojectionOptions:
     """Differences from the run's own preparation of masks; None keeps the run's choice.
 
-    masks: folder of other id images. classes: their classes.json. method: of reprojection. run_size: reproject at the
-    size of the training instead of the photos'. parser: options of ``beags-data`` instead of the run's own. data:
-    folder of the scene if it has moved.
+    masks: folder of other id images. classes: their classes.json. method: name of a reprojection. run_size: reproject
+    at the size of the training instead of the photos'. parser: options of ``beags-data`` instead of the run's own.
+    data: folder of the scene if it has moved.
     """
 
     masks: Path | None = None

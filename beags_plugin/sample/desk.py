@@ -39,9 +39,9 @@ def make_desk(seed: int) -> Room:
     hue = float(generator.uniform())
     stock = Stock(generator, noise, hue, spread=0.5)
     stack, mug = make_crate(stock), make_mug(stock, stock.about(0.135), stock.about(0.24))
-    generator.random(9)  # The random numbers of benchmarks' room come in between: for its spoon and its basket,
+    generator.random(9)  # The room of benchmarks/ draws these for spoon and basket: skipping them keeps old scenes.
     ball, vase = make_ball(stock), make_vase(stock)
-    generator.random(7)  # and for its frame.
+    generator.random(7)  # These are for its frame.
     crate = stack.things[0]
     x, y = crate.solid.vertices[:, :2].max(axis=0)
     turn = shell.turn @ turn_z(generator.uniform(0.0, 2.0 * np.pi))

@@ -1,4 +1,4 @@
-"""A family of generated scenes: what makes a scene, its light and its views from a seed."""
+"""A family of generated scenes: functions that make a scene, its light and its views from a seed."""
 
 from __future__ import annotations
 

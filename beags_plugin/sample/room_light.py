@@ -24,7 +24,7 @@ def _spiral(count: int) -> np.ndarray:
 
 
 class RoomLight:
-    """What measures the light at points of a room."""
+    """Measure the light at points of a room."""
 
     def __init__(self, room: Room, lamp_samples: int = 24, bounce_samples: int = 16) -> None:
         self.room = room

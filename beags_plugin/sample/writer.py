@@ -32,9 +32,9 @@ POINT_NOISE = 0.03
 """Noise of seed points, world units: two to three pixels at 256 x 192, as in a hand-held capture."""
 SAMPLE_FILE, TRACKS_FILE = "sample.json", "seed_tracks.json"
 ALIKE = {"exposure": 0.0, "white_balance": 0.0, "moved": 0, "shared_damage": 0.0}
-"""Entries of sample.json that tell what photos and masks of benchmarks' samples have in addition: nothing."""
+"""Entries of sample.json for the options that only samples of benchmarks/ have: they are off."""
 Flawed = Callable[[np.ndarray, np.ndarray, View], np.ndarray]
-"""From the exact mask and depth [H, W] of a training photo to its mask."""
+"""Function of the exact mask and depth [H, W] of a training photo and its view; returns the mask with shared errors."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,8 @@ class SampleConfig:
     degradation: errors of the train masks: "none", "mild", "strong", or a ``Degradation``.
     num_points: seed points. antialias: rays per pixel, along each axis, for the images.
 
-    Its photos are alike. A subclass may take others, by ``shots``, and make masks wrong, by ``damage`` and ``flaws``.
+    All photos have the same exposure and show the same scene. A subclass can change photos in ``shots``, and masks in
+    ``damage`` and ``flaws``.
     """
 
     seed: int = 0
@@ -89,7 +90,7 @@ class SampleConfig:
         return [Shot(view, scene, scene, light, light) for view in views]
 
     def flaws(self, scene: Scene, train: Sequence[str]) -> Flawed:
-        """Return what gives exact masks the errors that the training photos, by name, share: here there are none."""
+        """Return a function that adds the errors which masks of the training photos, by name, share: here none."""
         return lambda labels, depth, view: labels
 
 

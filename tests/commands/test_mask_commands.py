@@ -67,7 +67,7 @@ def test_photos_without_poses_get_masks_for_the_search_of_poses(tmp_path, capsys
 
 
 def test_masks_of_gaussian_grouping_are_trained_on(tmp_path, capsys):
-    """From the files of ids to what the data parser reads of them."""
+    """The data parser reads the masks that were made of the files of ids."""
     write_colmap(tmp_path)
     own = np.array([0, 37, 112], np.uint8)
     for index in range(9):

@@ -38,7 +38,7 @@ def splits(folder):
 
 
 def assert_tracks_agree(config: SampleConfig) -> None:
-    """Against rays cast from every photo to every point: nothing is met before the point, and none is of a visitor."""
+    """Check tracks by rays from every photo to every point: none meets anything before it, and none is of a visitor."""
     made = FAMILIES.get(config.family)
     views = [view for view in made.views(config.seed, 64, 48, 8, 1) if view.split == "train"]
     shots = config.shots(made, views)

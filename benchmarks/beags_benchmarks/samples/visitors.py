@@ -28,7 +28,7 @@ RAYS = 32, 24  # rays across and down that measure the share, for photos of ever
 
 
 def with_visitor(scene: Scene, view: View, seed: int) -> Scene:
-    """Return a scene of ``families`` with the visitor where ``view`` shows it; the seed and the view's name decide.
+    """Return the scene with the visitor where ``view`` shows it; the seed and the view's name decide.
 
     The visitor is the last fixture: it is background in every mask, and casts shadows.
     """

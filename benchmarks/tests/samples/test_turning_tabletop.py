@@ -12,7 +12,7 @@ from beags_plugin.sample.views import render_view
 
 
 def test_on_a_turntable_objects_look_the_same_and_the_room_stands():
-    """Against the tabletop's pictures; and of two cameras on a circle, which see one picture of the room."""
+    """Objects look as on the tabletop, and two cameras on a circle see the same picture of the room."""
     table, still = FAMILIES.get("turntable"), FAMILIES.get("tabletop")
     made = table.scene(0)
     views = table.views(0, 96, 72, 6, 1)
