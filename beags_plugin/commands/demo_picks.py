@@ -114,10 +114,10 @@ def things_apart(scene: MadeScene, output: Path, base: Path, objects: int) -> Ma
     folder, given = output / APART, scene.labels or scene.data
     masks, stamp = folder / "masks", folder / APART_STAMP
     made_of = value_digest([folder_digest(given / "masks"), _changed_at(base / "training.json"), objects])
-    former = read_object(stamp)
-    if former.get("of") == made_of and any(masks.rglob("*.png")):
+    former, exist = read_object(stamp), any(masks.rglob("*.png"))
+    if former.get("of") == made_of and exist:
         CONSOLE.print(f"Separated before: {masks}.")
-    elif stamp.exists() and former.get("masks") != folder_digest(masks):  # Masks beside a damaged stamp may be mended.
+    elif exist and stamp.exists() and former.get("masks") != folder_digest(masks):  # Masks beside a damaged stamp may be mended.
         CONSOLE.print(f"The masks in {masks} were mended, so they stay: delete {folder} for new ones.")
     else:
         shutil.rmtree(folder, ignore_errors=True)
