@@ -69,6 +69,12 @@ def photos_contradict(run: Path) -> bool:
     return path.exists() and bool(load_json(path).get("residuals", {}).get("contradict", False))
 
 
+def dropped_background(folder: Path) -> bool:
+    """Return whether the report of a preparation says that its grid was kept without voxels of the background."""
+    path = folder / PREPARATION_REPORT
+    return path.exists() and load_json(path).get("background_voxels") is False
+
+
 def prepared_labels(path: Path, camera: Camera) -> Tensor:
     """Read the labels [H, W] int32 of a prepared mask; raises ``UserError`` if it does not fit the camera."""
     if not path.is_file():

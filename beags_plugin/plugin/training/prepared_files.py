@@ -20,10 +20,13 @@ from beags_plugin.system.progress import counted, progress_bar
 from beags_plugin.system.whole_files import write_text_atomically, write_whole
 
 
-def save_prepared(prepared: Preparation, names: list[str], folder: Path, fit: Residuals | None = None) -> None:
+def save_prepared(
+    prepared: Preparation, names: list[str], folder: Path, background_voxels: bool, fit: Residuals | None = None
+) -> None:
     """Write what a resumed refinement needs; grid.pt comes last, as its presence marks the rest as complete.
 
-    fit: of the base to the photos, for the report; None if it was not measured.
+    background_voxels: whether the grid kept those that there are. fit: of the base to the photos, for the report; None
+    if it was not measured.
     """
     with writing(folder):
         (folder / "grid.pt").unlink(missing_ok=True)
@@ -38,7 +41,12 @@ def save_prepared(prepared: Preparation, names: list[str], folder: Path, fit: Re
                 path = folder / "confidence" / f"{name}.png"
                 with writing(path):  # PIL is used because cv2 ignores a full disk.
                     Image.fromarray(prepared.confidence[index].cpu().numpy()).save(path)
-    report = {"summary": prepared.summary, "seconds": prepared.seconds, "peak_memory_mb": peak_memory_mb()}
+    report = {
+        "summary": prepared.summary,
+        "seconds": prepared.seconds,
+        "peak_memory_mb": peak_memory_mb(),
+        "background_voxels": background_voxels,
+    }
     if prepared.agreement is not None:
         report["agreement"] = prepared.agreement.to_json(names)
     if fit is not None:

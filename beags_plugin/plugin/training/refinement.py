@@ -25,7 +25,7 @@ from beags_plugin.preparation.pipeline import check_masks, prepare
 from beags_plugin.preparation.refiner_training import Edit, OwnTraining, TrainedScene
 from beags_plugin.refiners import make_refiner
 from beags_plugin.runs.layout import BASE_SNAPSHOT, PREPARED
-from beags_plugin.runs.prepared import prepared_labels, read_grid
+from beags_plugin.runs.prepared import dropped_background, prepared_labels, read_grid
 from beags_plugin.runs.write import write_run
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import counted, progress_bar, say
@@ -210,7 +210,8 @@ class RefinementSwitch:
             say(f"  base kept in {snapshot}")
             if fit is not None and fit.contradict:
                 say(fit.sentence(), warning=True)
-            save_prepared(prepared, [view.name for view in views], self.trainer.base_dir / PREPARED, fit)
+            names = [view.name for view in views]
+            save_prepared(prepared, names, self.trainer.base_dir / PREPARED, self._background_voxels(), fit)
             if prepared.members is not None:  # Set after base/ is written, which holds the classes alone.
                 model.take_members(prepared.members)
             self._start(prepared.grid, prepared.labels)
@@ -283,7 +284,7 @@ class RefinementSwitch:
                 f"or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
             )
         grid = read_grid(folder / "grid.pt")
-        if grid is not None and self._background_voxels() and not bool((grid.classes == 0).any()):
+        if grid is not None and self._background_voxels() and dropped_background(folder):
             raise UserError(
                 f"{folder / 'grid.pt'} has no voxels of the background, which a loss now needs: set background of "
                 f"the occupancy loss to 0, or refine again from {BASE_SNAPSHOT}/nerfstudio_models."
