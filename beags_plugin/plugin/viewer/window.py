@@ -83,10 +83,6 @@ def set_up_finished(viewer: Viewer) -> Windows:
     viewer.make_stats_markdown = lambda step, size: f"Resolution: {size}"  # type: ignore[method-assign]
     viewer.stats_markdown.content = ""
     viewer.viser_server.gui.configure_theme(
-        titlebar_content=None,
-        control_layout="collapsible",
-        control_width="large",  # All tabs fit in one row.
-        dark_mode=True,
-        brand_color=(255, 211, 105),
+        titlebar_content=None, control_layout="collapsible", dark_mode=True, brand_color=(255, 211, 105)
     )
     return Windows(viewer)
