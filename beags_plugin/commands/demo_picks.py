@@ -117,9 +117,8 @@ def things_apart(scene: MadeScene, output: Path, base: Path, objects: int) -> Ma
     former, exist = read_object(stamp), any(masks.rglob("*.png"))
     if former.get("of") == made_of and exist:
         CONSOLE.print(f"Separated before: {masks}.")
-    elif (
-        exist and stamp.exists() and former.get("masks") != folder_digest(masks)
-    ):  # Masks beside a damaged stamp may be mended.
+    elif exist and stamp.exists() and former.get("masks") != folder_digest(masks):
+        # The user may have mended masks beside a damaged stamp.
         CONSOLE.print(f"The masks in {masks} were mended, so they stay: delete {folder} for new ones.")
     else:
         shutil.rmtree(folder, ignore_errors=True)
