@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE, count_ids
 from beags_plugin.labels.id_checks import check_ids, check_palettes
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.pasted import quoted
@@ -70,7 +70,7 @@ def palette_of(path: Path | str) -> dict[int, tuple[int, int, int]] | None:
     def read(image: Image) -> dict[int, tuple[int, int, int]] | None:
         if image.mode != "P" or image.palette is None:
             return None
-        used = np.unique(np.asarray(image)).tolist()
+        used = count_ids(np.asarray(image))[0].tolist()
         colors = np.zeros((256, 3), np.uint8)
         given = np.array(image.convert("P").getpalette("RGB") or [], np.uint8).reshape(-1, 3)
         colors[: len(given)] = given[:256]
@@ -100,7 +100,7 @@ def read_object_mask(path: Path | str, truth: bool = False) -> np.ndarray:
     if mode in {"L", *_COLOR_MODES} and brightest.max(initial=0) >= UNTOLD:
         if _is_picture(brightest):
             raise UserError(f"the mask {path} is a picture: fill the object white on black, without the photo below.")
-        shades = set(np.unique(channels).tolist())
+        shades = set(count_ids(channels)[0].tolist())
         inside, untold = brightest >= UNTOLD, (channels == UNTOLD).all(axis=2)
         untold &= (255 in shades or truth) and shades <= {0, UNTOLD, 255}
     else:

@@ -6,7 +6,7 @@ import colorsys
 
 import numpy as np
 
-from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE, count_ids
 
 
 def colorize(labels: np.ndarray) -> np.ndarray:
@@ -14,9 +14,11 @@ def colorize(labels: np.ndarray) -> np.ndarray:
 
     Background is black, IGNORE grey.
     """
-    ids, inverse = np.unique(np.asarray(labels), return_inverse=True)
-    colors = np.array([_color(int(class_id)) for class_id in ids], dtype=np.uint8).reshape(-1, 3)
-    return colors[inverse.reshape(np.shape(labels))]
+    ids, _ = count_ids(np.asarray(labels))
+    colors = np.zeros((int(ids.max(initial=0)) + 1, 3), np.uint8)
+    for class_id in ids.tolist():
+        colors[class_id] = _color(class_id)
+    return colors.take(labels, axis=0)
 
 
 def _color(class_id: int) -> tuple[int, int, int]:

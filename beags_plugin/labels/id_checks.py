@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.class_ids import IGNORE, count_ids
 from beags_plugin.system.errors import UserError
 
 LEAST_RAMPS = 12  # least outlines with a value in between, over all rows and columns; fewer may be chance
@@ -25,7 +25,7 @@ _COLORS = "beags masks make --source id-images --options folder=FOLDER colors=tr
 
 def check_ids(path: Path | str, labels: np.ndarray) -> None:
     """Raise ``UserError`` for labels [H, W] of a file that look smoothed or lossily compressed."""
-    if len(np.unique(labels)) < 3 or min(labels.shape) < 3:
+    if len(count_ids(labels)[0]) < 3 or min(labels.shape) < 3:
         return
     if (between := _ramps(labels)) is not None and _solid(labels).mean() >= LEAST_SOLID:
         raise UserError(

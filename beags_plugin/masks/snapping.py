@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.class_ids import IGNORE, count_ids
 from beags_plugin.system.errors import UserError
 
 EPSILON = 1e-4  # variance of linear colour (0..1) below which the guide counts as flat
@@ -24,7 +24,7 @@ def snap_to_edges(labels: np.ndarray, photo: np.ndarray, radius: int) -> np.ndar
 
     if not hasattr(getattr(cv2, "ximgproc", None), "guidedFilter"):
         raise UserError("this OpenCV has no guided filter: run beags doctor, which names the command that repairs it.")
-    ids = [int(i) for i in np.unique(labels) if i != IGNORE]
+    ids = [i for i in count_ids(labels)[0].tolist() if i != IGNORE]
     if radius < 1 or len(ids) < 2:
         return labels
     kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)

@@ -24,8 +24,8 @@ from beags_plugin.masks.sources import MASK_SOURCES
 from beags_plugin.masks.sources.base import MaskSource, NothingFound, Photo, SourceScene
 from beags_plugin.objects.check_masks import check, options_beside, write_contradictions
 from beags_plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
-from beags_plugin.pictures.cells import below, cell, wrapped, write_picture
-from beags_plugin.pictures.masks import overlay
+from beags_plugin.pictures.cells import below, wrapped, write_picture
+from beags_plugin.pictures.masks import tinted_cell
 from beags_plugin.runs.relocation import open_run
 from beags_plugin.runs.run import Run
 from beags_plugin.system.errors import UserError, check_choice, writing
@@ -226,5 +226,5 @@ def _picture(path: Path, pictured: Sequence[tuple[Photo, Path]]) -> None:
     cells = []
     for photo, mask in pictured[:: -(-len(pictured) // 24)]:
         size = (260, max(1, round(260 * photo.height / photo.width)))
-        cells.append([cell(overlay(photo.pixels(), read_id_mask(mask)), size, photo.name)])
+        cells.append([tinted_cell(photo.pixels(), read_id_mask(mask), size, photo.name)])
     write_picture(path, below(wrapped(cells, 1100)))

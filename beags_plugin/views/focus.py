@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE, count_ids
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
 from beags_plugin.views.close_ups import CloseUps, kept_pixels, kept_size, read_close_ups
@@ -130,7 +130,7 @@ def _aim(files: PhotoFiles, photo: int, labels: np.ndarray, kept: float) -> Aim:
 
 def _boxes(labels: np.ndarray) -> Iterator[np.ndarray]:
     """Yield the box of each object of labels [H, W], without small separate parts of its mask."""
-    for class_id in np.unique(labels):
+    for class_id in count_ids(labels)[0]:
         if class_id in (BACKGROUND, IGNORE):
             continue
         _, _, stats, _ = cv2.connectedComponentsWithStats((labels == class_id).astype(np.uint8), connectivity=8)

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from beags_plugin.data.files import image_size
-from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.class_ids import IGNORE, count_ids
 from beags_plugin.labels.classes import (
     check_names,
     read_binary_mask,
@@ -181,6 +181,15 @@ def test_colours_are_stable_and_distinct():
     assert np.array_equal(colorize(ids[3:5, 2:4]), colors[3:5, 2:4])
     assert colorize(np.array([[IGNORE]], dtype=np.uint16)).tolist() == [[[128, 128, 128]]]
     assert colorize(np.zeros((0, 4), dtype=np.uint16)).shape == (0, 4, 3)
+
+
+@pytest.mark.parametrize("shape", [(0, 3), (1, 1), (5, 7), (40, 30, 3)])
+def test_ids_are_counted(shape):
+    labels = np.random.default_rng(3).choice(np.array([0, 1, 1, 1, 9, IGNORE], np.uint16), shape)
+    ids, pixels = np.unique(labels, return_counts=True)
+    counted = count_ids(labels)
+    assert counted[0].tolist() == ids.tolist() and counted[1].tolist() == pixels.tolist()
+    assert counted[1].dtype == np.int64
 
 
 def test_an_image_too_large_to_decode_is_refused(tmp_path, monkeypatch):

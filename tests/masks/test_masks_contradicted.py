@@ -150,7 +150,7 @@ def test_points_are_drawn_where_they_are_in_photos_of_any_size(tmp_path):
     for name, (height, width) in {"tall": (600, 300), "wide": (300, 600)}.items():
         write_image(tmp_path / f"{name}.png", np.full((height, width, 3), 90, np.uint8))
         place = np.array([[0.25, 0.75]])
-        views.append(Pointed(name, tmp_path / f"{name}.png", np.ones((height, width)), place, np.array([0])))
+        views.append(Pointed(name, tmp_path / f"{name}.png", np.ones((height, width), np.uint16), place, np.array([0])))
     contradicted_picture(tmp_path / "out.png", views, [])
     with Image.open(tmp_path / "out.png") as picture:
         black = np.asarray(picture.convert("L"))[18:] == 0

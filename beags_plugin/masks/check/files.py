@@ -11,7 +11,7 @@ import numpy as np
 
 from beags_plugin.data.files import IMAGE_SUFFIXES, image_size
 from beags_plugin.data.orientation import turned_note, upright_mask_error
-from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
+from beags_plugin.labels.class_ids import BACKGROUND, IGNORE, count_ids
 from beags_plugin.labels.classes import palette_of, read_mask
 from beags_plugin.labels.id_checks import check_ids, check_palettes
 from beags_plugin.masks.check.issues import STOPS, Issue, named, percent
@@ -93,16 +93,16 @@ def check_files(files: MaskFiles, progress: Callable[[int, int], None] | None = 
         except UserError as error:
             return Issue("error", "type", str(error), STOPS, (files.stems[view],))
         assert labels is not None
-        pixels = np.bincount(labels.ravel(), minlength=IGNORE + 1)
-        if (ids := np.count_nonzero(pixels)) > MOST_IDS:
+        ids, pixels = count_ids(labels)
+        if len(ids) > MOST_IDS:
             return Issue(
                 "error",
                 "no id image",
-                f"the mask {path} holds {ids} different ids: this is no id image (a photo? depth?), replace it.",
+                f"the mask {path} holds {len(ids)} different ids: this is no id image (a photo? depth?), replace it.",
                 "training stops, or, without a classes.json, treats every value as an object",
                 (files.stems[view],),
             )
-        return {int(i): int(pixels[i]) for i in np.flatnonzero(pixels)}
+        return dict(zip(ids.tolist(), pixels.tolist(), strict=True))
 
     with ThreadPoolExecutor(max_workers=4) as pool:  # decoding a .png releases the interpreter
         for view, found in enumerate(pool.map(look, range(views))):

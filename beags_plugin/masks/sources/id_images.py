@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.labels.class_ids import IGNORE, count_ids
 from beags_plugin.labels.classes import read_classes, read_id_mask
 from beags_plugin.labels.id_checks import check_areas, check_ids
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene, per_photo
@@ -41,8 +41,8 @@ class IdImagesSource(MaskSource):
         views: Counter[int] = Counter()
         for photo in scene.photos:
             if photo.name in files:
-                present = np.unique(self._ids(files[photo.name], palette))
-                views.update(int(i) for i in present if i not in (0, IGNORE))
+                present, _ = count_ids(self._ids(files[photo.name], palette))
+                views.update(i for i in present.tolist() if i not in (0, IGNORE))
         used = {i for i, count in views.items() if count >= self.least_views}
         names = read_classes(None if self.names is None else scene.below(self.names), sorted(used))
         notes = [f"{len(views) - len(used)} ids in fewer than {self.least_views} views became background."]
