@@ -45,6 +45,7 @@ class PickTab:
         self._redraw = redraw
         self._boxing = False
         self._entries: dict[str, tuple[str, int]] = {}
+        self._named: tuple[int, str] | None = None  # place and name of the object whose name the control last got
         self.work = PickWork(viewing, self.report, self.refresh, self.picture)
         gui = server.gui
         formats = EXPORTERS.names()
@@ -147,6 +148,7 @@ class PickTab:
 
     def _rename(self, name: str) -> None:
         if name != self.work.picks.chosen.name:
+            self._named = self.work.picks.place, name
             self.work.change(lambda picks: picks.named(name))
 
     def _save(self) -> None:
@@ -199,7 +201,9 @@ class PickTab:
             if tuple(entries) != tuple(self.picked.options):
                 self.picked.options = tuple(entries)
             self._set(self.picked, next(label for label, place in places.items() if place == picks.place))
-            self._set(self.name, picks.chosen.name)
+            if (picks.place, picks.chosen.name) != self._named:  # else the user may be typing another name
+                self._named = picks.place, picks.chosen.name
+                self._set(self.name, picks.chosen.name)
             self._set(self.alone, self.work.alone)
         self._write()
         self._redraw()

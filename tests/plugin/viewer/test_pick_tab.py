@@ -240,6 +240,21 @@ def test_masks_are_saved_for_training_views_and_never_over_others(opened, capsys
     assert len(list((lab / "masks").glob("*.png"))) == len(files) and "--masks-path" not in tab.command
 
 
+def test_a_name_that_is_being_typed_is_kept(opened):
+    tab, _ = opened()
+    tab.name.value = "cup"  # has come from the page, but its handler has not run
+    click(tab, POINTS["low"], "Gaussians")
+    assert tab.name.value == "cup"
+    tab._rename(tab.name.value)
+    tab.work.change(lambda picks: picks.another())
+    click(tab, POINTS["high"], "Gaussians")
+    assert [one.name for one in tab.work.picks.objects] == ["cup", "object 1"]
+    assert tab.name.value == "object 1"
+    tab._choose("cup")
+    click(tab, POINTS["low"], "Gaussians")
+    assert tab.picked.value == tab.name.value == "cup"
+
+
 def test_masks_are_saved_for_photos_that_were_named_when_the_viewer_was_opened(opened, tmp_path):
     """``beags view RUN --data X`` names them where the photos that the run was trained on are gone."""
     tab, config = opened()
