@@ -124,6 +124,19 @@ TABLES: tuple[PageTable, ...] = (
         _REFINED[:3],
     ),
     PageTable(
+        "docs/results.md",
+        "captures-length",
+        "digger, 480 pixels",
+        _of_scene("captures-length", DIGGER, _ALL),
+        (
+            "assignment alone",
+            "as long as the paper, neither loss",
+            "the paper's losses",
+            "as long as beags-refine, neither loss",
+            "beags-refine",
+        ),
+    ),
+    PageTable(
         "notes/refinement-on-captures.md",
         "trade-off",
         "digger, 260 pixels",
