@@ -1,4 +1,4 @@
-# make setup | test [JOBS=n] | test-all [JOBS=n] | wheel | demo [DATA=folder] | docs | soak | fuzz [COUNT=n] [SEED=n] | lint | format | clean
+# make setup | test [JOBS=n] | test-all [JOBS=n] | wheel | demo [DATA=folder] | docs | notebook | soak | fuzz [COUNT=n] [SEED=n] | lint | format | clean
 # BEAGS_VENV names the environment; clones may share one. PYTHON names the interpreter that makes it.
 BEAGS_VENV ?= .venv
 BIN := $(BEAGS_VENV)/bin
@@ -9,7 +9,7 @@ export OMP_WAIT_POLICY = PASSIVE
 
 JOBS ?= 2
 
-.PHONY: help setup test test-all wheel demo docs soak fuzz lint format clean
+.PHONY: help setup test test-all wheel demo docs notebook soak fuzz lint format clean
 
 help:
 	@sed -n '1,2p' Makefile
@@ -45,6 +45,14 @@ docs: setup
 	  "$(BIN)/python" -m pip --disable-pip-version-check install -qq -c constraints.txt zensical mkdocstrings-python
 	"$(BIN)/python" scripts/docs_site.py
 	NO_COLOR=1 "$(BIN)/zensical" build --strict --clean
+
+# Runs docs/try_it.ipynb from top to bottom, and keeps its output in it.
+notebook: setup
+	@"$(BIN)/python" -c 'import ipykernel, nbconvert' 2>/dev/null || \
+	  "$(BIN)/python" -m pip --disable-pip-version-check install -qq ipykernel nbconvert
+	rm -rf build/notebook && mkdir -p build/notebook && cp docs/try_it.ipynb build/notebook
+	PATH="$(abspath $(BIN)):$$PATH" "$(BIN)/python" -m nbconvert --to notebook --execute --inplace build/notebook/try_it.ipynb
+	cp build/notebook/try_it.ipynb docs/try_it.ipynb
 
 # Long tests: random scenes and files, runs that are killed, memory over thousands of steps. About an hour.
 soak: fuzz

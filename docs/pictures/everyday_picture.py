@@ -1,9 +1,9 @@
-"""The five commands of "Every day" in README.md, a picture each, beside each other.
+"""The five commands of "Every day" in README.md, a picture each; the last has two.
 
-``python docs/pictures/everyday_picture.py TRAIN VIEW EVAL EXPORT RENDER``: files that the commands wrote, or what a
-browser showed of them; ``FILE:left,top,side`` takes that square of one, in pixels. README's are of the bear of
-``beags bench captures`` (the scene, the window of ``beags view``, ``bear.html`` in a browser, a view of ``beags render
---format sheet``), and of the demo for ``beags eval``, whose picture shows photos.
+``python docs/pictures/everyday_picture.py TRAIN VIEW EVAL EXPORT BEFORE AFTER``: files that the commands wrote, or what
+a browser showed of them; ``FILE:left,top,side`` takes that square of one, in pixels. README's are of the bear of
+``beags bench captures``: the scene, the tab Pick of its base, ``beags eval --picture``, ``bear.html`` in a browser, and
+the two halves of ``beags render --format before-after``.
 """
 
 from __future__ import annotations
@@ -15,10 +15,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from beags_plugin.pictures.cells import beside, cell, write_picture
+from beags_plugin.pictures.cells import below, beside, cell, write_picture
 
-CAPTIONS = ("train", "look and pick", "score", "export", "draw")
-SIDE = 240
+CAPTIONS = (
+    "train",
+    "view, and pick by clicks",
+    "eval: green is right",
+    "export (.html)",
+    "render: before",
+    "render: after",
+)
+SIDE = 300
 """Pixels of each picture."""
 
 
@@ -37,4 +44,4 @@ def square(argument: str) -> NDArray[np.uint8]:
 
 if __name__ == "__main__":
     cells = [cell(square(word), (SIDE, SIDE), caption) for word, caption in zip(sys.argv[1:], CAPTIONS, strict=True)]
-    write_picture(Path("docs/images/everyday.jpg"), beside(cells))
+    write_picture(Path("docs/images/everyday.jpg"), below([beside(cells[:3]), beside(cells[3:])]))

@@ -6,7 +6,6 @@ on the bear. Other views, objects or sides: ``--help``.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,15 +16,17 @@ from beags_plugin.cleaning.clean import clean
 from beags_plugin.core.select import select_class
 from beags_plugin.objects.evaluate import EvaluatedRun
 from beags_plugin.objects.shown import shown_scene
-from beags_plugin.pictures.cells import below, beside, cell, write_picture
+from beags_plugin.pictures.cells import GAP, below, beside, cell, write_picture
 from beags_plugin.pictures.objects import render_alone
 from beags_plugin.pictures.orbit import orbit, orbit_frame, orbit_settings
 from beags_plugin.surfaces.frames import bounding_box
 
+SHARE = 0.72  # part of the cameras' picture round the object that a cell shows
+
 
 @dataclass
 class Picture:
-    """A row for each stage: the object alone in that view, then from other sides."""
+    """Above, the scene in that view and the object alone in it, before and after; below, the same from other sides."""
 
     load_config: Path
     """config.yml of a refined run."""
@@ -35,15 +36,14 @@ class Picture:
     """Name of the object."""
     view: int = 0
     """Which of the held-out views."""
-    camera: tuple[int, ...] = (1, 4, 8)
+    camera: tuple[int, int] = (4, 8)
     """Which of the 12 cameras round the object."""
-    height: int = 300
-    """Pixels of each picture."""
+    size: tuple[int, int] = (300, 240)
+    """Width and height in pixels of the pictures above, which are cut out of the middle of the photo."""
 
     def write(self) -> None:
         run = EvaluatedRun(self.load_config)
         view = run.views[self.view]
-        of_photo = (math.ceil(self.height * view.camera.width / view.camera.height), self.height)
         whole = run.stages["after"].surfels()
         scene = render_alone(whole, view.camera, run.settings, run.rasterizer, "black")
         class_id = next(class_id for class_id, name in run.classes.items() if name == self.object)
@@ -54,19 +54,30 @@ class Picture:
         parts["after"] = parts["after"][clean(parts["after"], class_id, views)[0]]
         photos = run.run.viewpoints.cameras
         stand = orbit_frame(*bounding_box(parts["after"]), photos)
-        cameras = orbit(stand, 12, self.height)
-        rows = []
-        for caption, part in (("before", parts["before"]), ("after", parts["after"])):
+        side = (3 * self.size[0] - GAP) // 4
+        cameras = orbit(stand, 12, round(side / SHARE))
+        settings = orbit_settings(stand)
+        above, beneath = [cell(middle(scene, self.size), self.size, "the scene")], []
+        for stage, part in parts.items():
             in_view = render_alone(part, view.camera, run.settings, run.rasterizer, "checker")
-            sides = [
-                render_alone(part, cameras[number], orbit_settings(stand), run.rasterizer, "checker")
-                for number in self.camera
-            ]
-            cells = [cell(side, (self.height, self.height), caption) for side in sides]
-            rows.append([cell(in_view, of_photo, caption), *cells])
-        there = beside([cell(scene, of_photo, "the scene"), *(row[0] for row in rows)])
-        picture = below([there, *(beside(row[1:]) for row in rows)])
-        write_picture(self.output, np.ascontiguousarray(picture))
+            above.append(cell(middle(in_view, self.size), self.size, stage))
+        for number in self.camera:
+            for stage, part in parts.items():
+                image = render_alone(part, cameras[number], settings, run.rasterizer, "checker")
+                beneath.append(cell(cropped(image, (side, 3 * side // 4)), (side, 3 * side // 4), stage))
+        write_picture(self.output, np.ascontiguousarray(below([beside(above), beside(beneath)])))
+
+
+def cropped(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return the middle of an image [H, W, 3], ``size`` (width, height) pixels large."""
+    left, top = ((have - want) // 2 for have, want in zip(image.shape[1::-1], size, strict=True))
+    return image[top : top + size[1], left : left + size[0]]
+
+
+def middle(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return the largest part of an image's middle that has the proportions of ``size`` (width, height)."""
+    scale = min(image.shape[1] / size[0], image.shape[0] / size[1])
+    return cropped(image, (int(size[0] * scale), int(size[1] * scale)))
 
 
 if __name__ == "__main__":

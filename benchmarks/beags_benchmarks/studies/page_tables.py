@@ -125,6 +125,13 @@ TABLES: tuple[PageTable, ...] = (
     ),
     PageTable(
         "docs/results.md",
+        "captures-skull",
+        "skull, 400 pixels",
+        _of_scene("captures-skull", "dtu_skull, given", _ALL),
+        _REFINED[:3],
+    ),
+    PageTable(
+        "docs/results.md",
         "captures-length",
         "digger, 480 pixels",
         _of_scene("captures-length", DIGGER, _ALL),
