@@ -78,6 +78,11 @@ def test_links_hold_in_the_site(document, text, alone, published):
     assert docs_site.rewritten(text, ROOT / document, "R", set()) == (published or alone)
 
 
+def test_no_page_has_diagrams_that_the_site_would_show_as_code(pages):
+    languages = {word for page in pages.rglob("*.md") for word in re.findall(r"^```(\w+)", page.read_text("utf8"), re.M)}
+    assert languages <= {"python", "text"}
+
+
 def test_files_that_pages_show_lie_beside_them(pages):
     assert (pages / "images/pick.jpg").is_file()
     assert not (pages / "pictures").exists()
