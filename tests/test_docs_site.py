@@ -79,7 +79,9 @@ def test_links_hold_in_the_site(document, text, alone, published):
 
 
 def test_no_page_has_diagrams_that_the_site_would_show_as_code(pages):
-    languages = {word for page in pages.rglob("*.md") for word in re.findall(r"^```(\w+)", page.read_text("utf8"), re.M)}
+    languages = {
+        word for page in pages.rglob("*.md") for word in re.findall(r"^```(\w+)", page.read_text("utf8"), re.M)
+    }
     assert languages <= {"python", "text"}
 
 

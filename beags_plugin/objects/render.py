@@ -12,8 +12,11 @@ import torch
 
 from beags_plugin.core.cameras import Camera, viewmat_from_opengl
 from beags_plugin.core.select import select_class
+from beags_plugin.labels.class_ids import BACKGROUND
+from beags_plugin.objects.clean import cleaner_of
 from beags_plugin.objects.export import Progress
 from beags_plugin.objects.extract import chosen_objects, folder_names, objects_with_gaussians
+from beags_plugin.objects.shown import Shown
 from beags_plugin.pictures.cells import write_picture
 from beags_plugin.pictures.objects import Subject, comparison, film, sheet
 from beags_plugin.pictures.options import PictureFormat, RenderOptions
@@ -39,7 +42,7 @@ def render_run(
     progress: Progress | None = None,
     data: Path | None = None,
 ) -> Path:
-    """Render objects of a run alone, from cameras around each, into one file; return its path.
+    """Render objects of a run alone, as their files have them, from cameras around each; return the one file's path.
 
     config_path: config.yml of a refined (or assigned) run. objects: names; all but the background if empty. form:
     "video" (.mp4, .gif), "sheet" (.png, .jpg), or "before-after", either kind of file with the object before and after
@@ -145,11 +148,13 @@ def _subjects(
     if form == "before-after" and not moving:
         count = max(1, count // 2)
     size = options.size or (480 if moving else 400 if form == "before-after" else 232)
-    subjects = []
+    subjects, cleaner = [], cleaner_of(Shown(run))
     for name, class_id in chosen.items():
-        parts = {
-            caption: select_class(scene.surfels(), scene.members, class_id)[0] for caption, scene in stages.items()
-        }
+        parts = {}
+        for caption, scene in stages.items():
+            parts[caption], index = select_class(scene.surfels(), scene.members, class_id)
+            if scene is run.assigned and class_id != BACKGROUND:
+                parts[caption] = cleaner.clean(parts[caption], index, class_id)[0]
         stand = orbit_frame(*bounding_box(list(parts.values())[-1]), photos)
         cameras = orbit(stand, count, size, options.elevation, options.turn)
         subjects.append(Subject(name, parts, cameras, orbit_settings(stand)))

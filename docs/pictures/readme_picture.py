@@ -21,7 +21,7 @@ from beags_plugin.pictures.objects import render_alone
 from beags_plugin.pictures.orbit import orbit, orbit_frame, orbit_settings
 from beags_plugin.surfaces.frames import bounding_box
 
-SHARE = 0.72  # part of the cameras' picture round the object that a cell shows
+SHARE = 0.88  # part of the cameras' picture round the object that a cell shows
 
 
 @dataclass

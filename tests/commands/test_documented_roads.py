@@ -52,6 +52,7 @@ class Reader:
     def does(self, line: str) -> Path | None:
         """Run a command as it stands, but shorter; return the run of a training."""
         if self.runs:
+            line = line.replace("$PWD/outputs", "outputs")
             line = line.replace("outputs/.../nerfstudio_models", f"{self.runs[0]}/nerfstudio_models")
             line = re.sub(r"(outputs/)?\.\.\./", f"{self.runs[-1]}/", line)
         program, *words = words_of(line)

@@ -12,9 +12,12 @@ from run_folders import write_camera_path, write_scene, write_trained
 
 pytest.importorskip("nerfstudio")
 
+from beags_plugin.cleaning.clean import LeftOut
 from beags_plugin.commands.cli import main
-from beags_plugin.objects.render import render_run
+from beags_plugin.objects.render import _subjects, render_run
 from beags_plugin.pictures.options import RenderOptions
+from beags_plugin.runs.belonging import Belonging
+from beags_plugin.runs.run import Run
 from beags_plugin.system.errors import UserError
 
 SMALL = RenderOptions(size=32, frames=3, views=4)
@@ -48,6 +51,18 @@ def test_before_and_after_differ_where_the_base_did(config, tmp_path):
     before, after = picture[18:50, :32], picture[18:50, 36:68]
     assert not np.array_equal(before, after)  # the base's cup is off
     assert render_run(config, ("cup",), "before-after", tmp_path / "a.gif", SMALL).exists()
+
+
+def test_what_does_not_belong_to_an_object_is_left_out_after_refinement(config, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(config.parent, run)
+    opened, base = Run(run / "config.yml"), Run(run / "base/config.yml")
+    (cup,) = (class_id for class_id, name in opened.scene.classes.items() if name == "cup")
+    members = opened.assigned.members.of(cup).nonzero()[:, 0]
+    Belonging(opened.scene, run).keep(cup, members[2:], LeftOut())
+    stages = {"before": base.assigned, "after": opened.assigned}
+    (subject,) = _subjects(opened, stages, {"cup": cup}, "before-after", False, SMALL)
+    assert len(subject.stages["after"]) == 2 and len(subject.stages["before"]) > 2
 
 
 def test_a_video_is_the_default(config):
