@@ -49,7 +49,7 @@ RUN = {  # In this order, each command in README.md with the flags to append.
     "beags masks check --data X": "",
     "ns-train beags-fast --data my_scene": SHORT.replace("base-steps 60", "base-steps 200"),  # killed on its way
     "beags resume RUN": "",  # The killed training goes on.
-    f"beags export {CONFIG} --all --format ply glb": "--resolution 24 --output exported",
+    f"beags export {CONFIG} --all --format ply glb html": "--resolution 24 --output exported",
     "beags masks reproject --load-config C": "",
     "beags view outputs/...": "",  # It runs until its page is there.
     f"beags eval {CONFIG} --picture worst.png": "",
