@@ -2,8 +2,8 @@
 
 ``python docs/pictures/everyday_picture.py TRAIN VIEW EVAL EXPORT BEFORE AFTER``: files that the commands wrote, or what
 a browser showed of them; ``FILE:left,top,side`` takes that square of one, in pixels. README's are of the bear of
-``beags bench captures``: the scene, the tab Pick of its base, ``beags eval --picture``, ``bear.html`` in a browser, and
-the two halves of ``beags render --format before-after``.
+``beags bench captures`` (the scene, and cells of ``beags render --format before-after``), and of the demo for the tab
+Pick and for ``beags eval --picture``, which shows photos.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CAPTIONS = (
     "train",
     "view, and pick by clicks",
     "eval: green is right",
-    "export (.html)",
+    "export",
     "render: before",
     "render: after",
 )
