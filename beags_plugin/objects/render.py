@@ -12,8 +12,9 @@ import torch
 
 from beags_plugin.core.cameras import Camera, viewmat_from_opengl
 from beags_plugin.core.select import select_class
+from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import BACKGROUND
-from beags_plugin.objects.clean import cleaner_of
+from beags_plugin.objects.clean import Cleaner, cleaner_of
 from beags_plugin.objects.export import Progress
 from beags_plugin.objects.extract import chosen_objects, folder_names, objects_with_gaussians
 from beags_plugin.objects.shown import Shown
@@ -99,11 +100,10 @@ def _along(
     scene = run.assigned if objects or form != "video" else run.scene
     stages = {"": scene} if form == "video" else {"before": _base_of(config_path), "after": scene}
     present = objects_with_gaussians(scene, objects, config_path.parent) if objects else {}
-    parts = {}
+    parts, cleaner = {}, cleaner_of(Shown(run))
     for caption, each in stages.items():
-        surfels, members = each.surfels(), each.members
-        chosen = [members.of(present[name]) for name in objects]
-        parts[caption] = surfels[torch.stack(chosen).any(dim=0)] if chosen else surfels
+        rows = [_part(run, each, present[name], cleaner)[1] for name in objects]
+        parts[caption] = each.surfels()[torch.cat(rows).sort().values] if rows else each.surfels()
     subject = Subject("", parts, cameras, run.settings)
     write_film(output, film([subject], run.rasterizer, options.background, progress), fps)
     return output
@@ -132,6 +132,14 @@ def _base_of(config_path: Path) -> SavedScene:
     return Run(snapshot).assigned
 
 
+def _part(run: Run, scene: SavedScene, class_id: int, cleaner: Cleaner) -> tuple[Surfels, torch.Tensor]:
+    """Return an object and its rows [K] int64 in the scene; of the run's own scene as its file has it."""
+    part, index = select_class(scene.surfels(), scene.members, class_id)
+    if scene is run.assigned and class_id != BACKGROUND:
+        part, index, _ = cleaner.clean(part, index, class_id)
+    return part, index
+
+
 def _subjects(
     run: Run,
     stages: dict[str, SavedScene],
@@ -152,9 +160,7 @@ def _subjects(
     for name, class_id in chosen.items():
         parts = {}
         for caption, scene in stages.items():
-            parts[caption], index = select_class(scene.surfels(), scene.members, class_id)
-            if scene is run.assigned and class_id != BACKGROUND:
-                parts[caption] = cleaner.clean(parts[caption], index, class_id)[0]
+            parts[caption], _ = _part(run, scene, class_id, cleaner)
         stand = orbit_frame(*bounding_box(list(parts.values())[-1]), photos)
         cameras = orbit(stand, count, size, options.elevation, options.turn)
         subjects.append(Subject(name, parts, cameras, orbit_settings(stand)))

@@ -1,4 +1,4 @@
-"""The picture of the tab Pick in docs/viewer.md: an object of a base cut out by clicks, in a headless Chromium.
+"""The picture of the tab Pick in docs/viewer.md: an object of a base cut out by one click, in a headless Chromium.
 
 Run ``beags demo`` first; then ``python docs/pictures/pick_picture.py``. Another run or place of the click: ``--help``.
 """
@@ -22,8 +22,8 @@ class Picture:
     """config.yml of a run; a base will do."""
     output: Path = Path("docs/images/pick.jpg")
     """The file."""
-    click: tuple[tuple[int, int], ...] = ((497, 630),)
-    """Pixels of the window, across and down, on the object."""
+    click: tuple[int, int] = (497, 630)
+    """Pixel of the window, across and down, on the object."""
     name: str = "ball"
     """What it is called."""
     width: int = 1280
@@ -40,10 +40,8 @@ class Picture:
             page.tick("Click to pick")
             page.write("Name", self.name)
             settled(page)
-            for place in self.click:
-                page.click(*place)
-                page.wait_for_text(" Gaussians (", 300)
-                settled(page)
+            page.click(*self.click)
+            page.wait_for_text(" Gaussians (", 300)
             Image.fromarray(settled(page)).save(self.output, quality=85, optimize=True)
 
 
