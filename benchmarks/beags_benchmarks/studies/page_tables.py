@@ -124,7 +124,7 @@ TABLES: tuple[PageTable, ...] = (
         _REFINED[:3],
     ),
     PageTable(
-        "docs/results.md",
+        "notes/refinement-on-captures.md",
         "captures-skull",
         "skull, 400 pixels",
         _of_scene("captures-skull", "dtu_skull, given", _ALL),
