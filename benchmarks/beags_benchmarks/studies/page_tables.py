@@ -130,6 +130,16 @@ TABLES: tuple[PageTable, ...] = (
         _of_scene("captures-skull", "dtu_skull, given", _ALL),
         _REFINED[:3],
     ),
+    *(
+        PageTable(
+            "notes/refinement-on-captures.md",
+            f"picked-{name}",
+            f"{name}, 260 pixels",
+            _of_scene("captures-picked", f"{scene}, picked", _ALL),
+            (*_REFINED[:3], "as long as the paper, neither loss", "the paper's losses"),
+        )
+        for name, scene in {"bear": "bear", "digger": "kitchen"}.items()
+    ),
     PageTable(
         "docs/results.md",
         "captures-length",
