@@ -47,11 +47,10 @@ class Picture:
         whole = run.stages["after"].surfels()
         scene = render_alone(whole, view.camera, run.settings, run.rasterizer, "black")
         class_id = next(class_id for class_id, name in run.classes.items() if name == self.object)
-        parts = {
-            stage: select_class(scene.surfels(), scene.members, class_id)[0] for stage, scene in run.stages.items()
-        }
-        views = shown_scene(run.run).views
-        parts["after"] = parts["after"][clean(parts["after"], class_id, views)[0]]
+        parts, views = {}, shown_scene(run.run).views
+        for stage, saved in run.stages.items():
+            part, _ = select_class(saved.surfels(), saved.members, class_id)
+            parts[stage] = part[clean(part, class_id, views)[0]]
         photos = run.run.viewpoints.cameras
         stand = orbit_frame(*bounding_box(parts["after"]), photos)
         side = (3 * self.size[0] - GAP) // 4

@@ -69,12 +69,13 @@ ELSEWHERE = {
     "beags clean SCENE --data X": "refines a whole scene; test_clean_command.py runs it",
     "beags process --data PHOTOS_OR_VIDEO --output-dir X": "this scene has no texture; test_process.py runs it",
     "beags bench NAME": "trains for minutes; test_bench_running.py runs experiments to their tables",
+    "beags masks weights": "fetches a file; test_salient_source.py runs it",
+    "beags masks agree --load-config C": "test_mask_commands.py runs it",
     "beags masks truth --data X": "needs downloaded masks; test_downloads.py runs it",
     "make demo": "beags demo is run; what make calls is looked at below",
     "make demo DATA=walk.mp4": "the same",
     "make test": "runs these tests",
     "pip install .": "make setup has done it, editable, in the environment that runs this test",
-    "pip install dist/beags-*.whl": "test_wheel.py installs it in a fresh environment",
 }
 OWN = {  # name in README.md: name here
     r" \[.*\]": "",

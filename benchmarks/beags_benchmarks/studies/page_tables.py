@@ -200,9 +200,9 @@ _METRICS = (
     "removal_psnr_shown_after",
 )
 _ROW = ("scene", "seed", "variant", "failed", "failures", "error_left", "lost_biou", "shown_after", "ssim_after",
-        "rendered_iou_after", "rendered_biou_after", "extracted_spill_before", "extracted_spill_after",
-        "psnr_fit_before", "psnr_fit_after", "removal_ssim_after", "removal_remains_after", "steps",
-        "cpu_seconds", "cpu_seconds total", "own_memory_mb", "peak_memory_mb", "objects")  # fmt: skip
+        "rendered_iou_after", "rendered_biou_after", "rendered_covered_after", "extracted_spill_before",
+        "extracted_spill_after", "psnr_fit_before", "psnr_fit_after", "removal_ssim_after", "removal_remains_after",
+        "steps", "cpu_seconds", "cpu_seconds total", "own_memory_mb", "peak_memory_mb", "objects")  # fmt: skip
 _OF_OBJECTS = "extracted_biou_after"
 
 
