@@ -162,6 +162,13 @@ TABLES: tuple[PageTable, ...] = (
     ),
     PageTable(
         "notes/refinement-on-captures.md",
+        "trade-off-bear",
+        "bear, 260 pixels",
+        _of_scene("trade-off-bear", BEAR, _COSTS),
+        ("200 steps (beags-fast)", "50 steps", "800 steps", "k / 8", "k x 8", "Z = 5", "Z = 100", "no reprojection"),
+    ),
+    PageTable(
+        "notes/refinement-on-captures.md",
         "bases",
         "digger, 260 pixels",
         _of_scene("trade-off-kitchen", DIGGER, _OF_BASES),
