@@ -32,7 +32,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.picking.graph import surface_graph
 from beags_plugin.picking.sight import seen_from
-from beags_plugin.picking.walk import Walker
+from beags_plugin.picking.walk import Walker, least_size
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
 from beags_plugin.system.errors import UserError
@@ -45,7 +45,6 @@ BELIEF = 0.3  # weight of logit p, beside links of at most 1
 BOUND = 1e3  # more than the sum of all links of a Gaussian
 NOTHING = -30.0  # logit of an invisible opacity
 MUCH = 0.5  # share of the scene above which a cut is reported as large
-LITTLE, FEW = 0.002, 100  # share of the scene, and number of Gaussians, below both of which a cut is reported as small
 LIMIT = 1e-6  # bound of p that keeps its logit finite
 
 
@@ -61,7 +60,7 @@ def takes_much(members: Tensor) -> str | None:
 def takes_little(members: Tensor) -> str | None:
     """Return a note on a cut, [N] bool, that takes little more than its points, or None."""
     count = int(members.sum())
-    if count >= min(FEW, LITTLE * len(members)):
+    if count >= least_size(len(members)):
         return None
     return "little more than the points themselves: click on other parts of the object too, or press Grow"
 

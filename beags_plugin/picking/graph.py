@@ -27,7 +27,7 @@ from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.picking.dots import dots
 
-NEIGHBOURS = 10
+NEIGHBOURS = 20
 LEAST_WEIGHT = 0.3  # least weight over all views, in pixels, of a Gaussian of the visible surface
 CONCAVE, CONVEX, STEP, COLOR, DISTANCE = 30.0, 0.5, 30.0, 2.0, 0.2
 # Bounds of points on a tangent plane: height in s, height per unit of distance, least cosine between normals.

@@ -11,11 +11,19 @@ import numpy as np
 from beags_plugin.picking.dots import dots
 from beags_plugin.picking.graph import FLOOR, SHORTEST, SurfaceGraph
 
-LEAK = 2e-3  # weight of stopping, beside links of at most 1
+# A walk stops with weight LEAK / number of nodes, beside links of at most 1, so that it crosses a share of the scene.
+LEAK = 60.0
+MOST_LEAK = 0.03  # largest such weight, in scenes of few nodes
 MORE_LEAK = 5e-2  # added on the tangent planes of marks beside the object
-TOLERANCE = 1e-4  # norm of the residual, over that at the start
+TOLERANCE = 1e-3  # norm of the residual, over that at the start
 MOST_ITERATIONS = 2_000
 LEAST_LEVEL, HIGHEST_LEVEL = 0.1, 0.98  # bounds of a border's level
+LITTLE, FEW = 0.002, 100  # share of the scene, and number of Gaussians, below both of which a cut is small
+
+
+def least_size(count: int) -> float:
+    """Return the number of Gaussians below which a cut of a scene of ``count`` is small."""
+    return min(FEW, LITTLE * count)
 
 
 class Walker:
@@ -33,7 +41,7 @@ class Walker:
         values = np.concatenate([graph.weights, graph.weights])
         self._graph = graph
         self._links = csr_array((values, (rows, columns)), shape=(count, count))
-        self._degree = np.bincount(rows, values, count) + LEAK
+        self._degree = np.bincount(rows, values, count) + min(LEAK / max(count, 1), MOST_LEAK)
 
     def potential(
         self, inside: np.ndarray, outside: np.ndarray, excluded: np.ndarray, leaking: np.ndarray
@@ -67,9 +75,12 @@ class Walker:
         """Return the level t for which {p >= t} has the shortest border for its size, length / sqrt(area).
 
         The length is the sum of weight times length over the cut links (``graph``). A border grows like the square root
-        of the area, so that the quotient favours no size. 0.5 if no p lies between ``LEAST_LEVEL`` and
-        ``HIGHEST_LEVEL``. weights: [P] float64, of the graph's links, 0 to excluded nodes. part: whether there must be
-        a border, so that {p >= t} is not everything.
+        of the area, so that the quotient favours no size; but noise encloses a few Gaussians with a short border, so
+        small sets (``least_size``) do not count where there are larger ones. 0.5 if no p lies between ``LEAST_LEVEL``
+        and ``HIGHEST_LEVEL``.
+
+        weights: [P] float64, of the graph's links, 0 to excluded nodes. part: whether there must be a border, so that
+        {p >= t} is not everything.
         """
         count = len(p)
         order = np.argsort(-p, kind="stable")
@@ -85,6 +96,8 @@ class Walker:
         allowed = np.flatnonzero((p[order] >= LEAST_LEVEL) & (p[order] <= HIGHEST_LEVEL) & there)
         if len(allowed) == 0:
             return 0.5
+        large = allowed[allowed + 1 >= least_size(count)]
+        allowed = large if len(large) else allowed
         best = allowed[np.argmin(quotient[allowed])]
         following = p[order[best + 1]] if best + 1 < count else 0.0
         return float(0.5 * (p[order[best]] + following))  # halfway, so that no node lies exactly at the level
