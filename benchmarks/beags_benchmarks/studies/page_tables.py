@@ -135,7 +135,7 @@ TABLES: tuple[PageTable, ...] = (
             "notes/refinement-on-captures.md",
             f"picked-{name}",
             f"{name}, 260 pixels",
-            _of_scene("captures-picked", f"{scene}, picked", _ALL),
+            _of_scene(f"captures-picked-{name}", f"{scene}, picked", _ALL),
             (*_REFINED[:3], "as long as the paper, neither loss", "the paper's losses"),
         )
         for name, scene in {"bear": "bear", "digger": "kitchen"}.items()
