@@ -103,7 +103,7 @@ def _along(
     parts, cleaner = {}, cleaner_of(Shown(run))
     for caption, each in stages.items():
         rows = [_part(run, each, present[name], cleaner)[1] for name in objects]
-        parts[caption] = each.surfels()[torch.cat(rows).sort().values] if rows else each.surfels()
+        parts[caption] = each.surfels()[torch.cat(rows).unique()] if rows else each.surfels()
     subject = Subject("", parts, cameras, run.settings)
     write_film(output, film([subject], run.rasterizer, options.background, progress), fps)
     return output

@@ -34,7 +34,7 @@ LEAST_ERROR = 2e-4  # share of a picture below which an error is not clicked
 
 
 class _Click(NamedTuple):
-    area: float  # of the error, share of the picture
+    area: float  # share of the picture that the error covers
     view: int
     row: int
     column: int

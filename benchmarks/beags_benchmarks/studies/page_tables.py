@@ -82,6 +82,7 @@ _REFINED = (
     "beags-refine",
     "the paper's losses",
 )
+_CHOICES = ("200 steps (beags-fast)", "50 steps", "800 steps", "k / 8", "k x 8", "Z = 5", "Z = 100", "no reprojection")
 _COMPARED = (
     "assignment alone",
     "flashsplat",
@@ -153,19 +154,18 @@ TABLES: tuple[PageTable, ...] = (
             "beags-refine",
         ),
     ),
-    PageTable(
-        "notes/refinement-on-captures.md",
-        "trade-off",
-        "digger, 260 pixels",
-        _of_scene("trade-off-kitchen", DIGGER, _COSTS),
-        ("200 steps (beags-fast)", "50 steps", "800 steps", "k / 8", "k x 8", "Z = 5", "Z = 100", "no reprojection"),
-    ),
-    PageTable(
-        "notes/refinement-on-captures.md",
-        "trade-off-bear",
-        "bear, 260 pixels",
-        _of_scene("trade-off-bear", BEAR, _COSTS),
-        ("200 steps (beags-fast)", "50 steps", "800 steps", "k / 8", "k x 8", "Z = 5", "Z = 100", "no reprojection"),
+    *(
+        PageTable(
+            "notes/refinement-on-captures.md",
+            table,
+            f"{name}, 260 pixels",
+            _of_scene(file, scene, _COSTS),
+            _CHOICES,
+        )
+        for table, name, file, scene in (
+            ("trade-off", "digger", "trade-off-kitchen", DIGGER),
+            ("trade-off-bear", "bear", "trade-off-bear", BEAR),
+        )
     ),
     PageTable(
         "notes/refinement-on-captures.md",
