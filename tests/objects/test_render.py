@@ -103,6 +103,14 @@ def test_a_camera_path_is_followed_as_nerfstudio_does(config, camera_path, tmp_p
     assert pair[0].shape == (96 + 18 + 4, 2 * (128 + 4), 3)
 
 
+def test_gaussians_of_two_named_objects_are_drawn_once(config, camera_path, tmp_path):
+    """An object named twice stands for objects that share Gaussians."""
+    options = RenderOptions(camera_path=camera_path)
+    once = frames(render_run(config, ("cup",), "video", tmp_path / "once.mp4", options))
+    twice = frames(render_run(config, ("cup", "cup"), "video", tmp_path / "twice.mp4", options))
+    assert all(np.array_equal(one, other) for one, other in zip(once, twice, strict=True))
+
+
 def test_a_base_without_classes_is_shown_along_a_path(tmp_path, camera_path):
     config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"), assigned=False)
     film = render_run(config, options=RenderOptions(camera_path=camera_path))
