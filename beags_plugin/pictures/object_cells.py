@@ -24,6 +24,7 @@ from beags_plugin.surfaces.frames import bounding_box
 COLUMNS = 6  # cells in a line
 SMALLEST, LARGEST = 150, 480  # bounds for the side of a cell, pixels
 FAINT = 0.1  # alpha from which a stray Gaussian widens the crop
+STRAYS = 1.5  # most that strays of earlier stages widen the crop of the last one, times its side
 _VIEWS = 2  # views in a line, each with photo, before and after
 _PROBE, _ROOM = 160, 3.0  # pixels, and sides of the object's box, of the search for stray Gaussians
 _BELOW, _LEVEL = -30.0, 10.0  # degrees above the horizon
@@ -88,8 +89,8 @@ def object_shots(
     """Return the pictures to render of an object, at the resolution of the photos' files.
 
     The first line has two held-out photos from sides far apart, each with the object at every stage. The second has two
-    sides from below the horizon and the side that photos show least. Crops hold everything that is rendered, also
-    strays.
+    sides from below the horizon and the side that photos show least. Crops hold everything that is rendered of the last
+    stage, also strays; those of earlier stages widen them by at most ``STRAYS``.
 
     stages: caption to the object's Gaussians alone; the last one with any defines its place. views: held-out views;
     those that do not show the object are left out. cameras: cameras of the training photos.
@@ -166,10 +167,20 @@ def _in_view(view: EvalView, class_id: int, stages: Mapping[str, Surfels], drawi
 def _shown(
     mask: np.ndarray, camera: Camera, settings: RasterSettings, stages: Mapping[str, Surfels], rasterizer: Rasterizer
 ) -> Square:
-    """Return the square around the pixels of ``mask`` [H, W] bool and all that the object covers at any stage."""
-    for surfels in stages.values():
-        mask = mask | (alone(surfels, camera, settings, rasterizer)[..., 3] > 255 * FAINT)
-    return square_around(mask)
+    """Return the square around the pixels of ``mask`` [H, W] bool and what the object covers.
+
+    All that it covers at the last stage with any Gaussians is in it; earlier stages widen it by at most ``STRAYS``.
+    """
+    *earlier, last = [each for each in stages.values() if len(each)]
+    covered = [alone(each, camera, settings, rasterizer)[..., 3] > 255 * FAINT for each in (*earlier, last)]
+    whole = mask | covered[-1]
+    if not whole.any():
+        return square_around(np.logical_or.reduce(covered))
+    top, left, length = square_around(whole)
+    room = round((STRAYS - 1) / 2 * length)
+    near = np.zeros_like(whole)
+    near[max(top - room, 0) : top + length + room, max(left - room, 0) : left + length + room] = True
+    return square_around(np.logical_or.reduce([whole, *(each & near for each in covered[:-1])]))
 
 
 def _photo(view: EvalView, full: Camera, window: Square) -> np.ndarray | None:

@@ -17,7 +17,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.records import EvalView, FullPhoto
 from beags_plugin.pictures.cells import GAP, write_picture
 from beags_plugin.pictures.contact_sheet import contact_sheet
-from beags_plugin.pictures.object_cells import COLUMNS, LARGEST, Drawing, cell_size, object_shots, views_of
+from beags_plugin.pictures.object_cells import COLUMNS, LARGEST, STRAYS, Drawing, cell_size, object_shots, views_of
 from beags_plugin.pictures.orbit import least_shown, orbit, orbit_frame, orbit_settings, side, view_from
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.system.errors import UserError
@@ -164,6 +164,17 @@ def test_a_stray_far_from_the_object_is_in_the_picture():
     (line,) = cells(object_cells(1, "ball", stages, [], photos(), BALLS), LARGEST)
     assert all(black(cell) > 0.00005 for cell in line[1::2])
     assert not any(black(cell) for cell in line[::2])
+
+
+def test_a_stray_that_refinement_removed_does_not_make_the_object_small():
+    stray = moved(ball(0.0, count=1), 0.0, 0.0, -2.6, size=0.5)
+    plain = {"before": ball(0.0), "after": ball(0.0)}
+    (line,), (other,) = (
+        cells(object_cells(1, "ball", stages, [], photos(), BALLS), LARGEST)
+        for stages in (plain, {**plain, "before": joined(ball(0.0), stray)})
+    )
+    for full, small in zip(line[1::2], other[1::2], strict=True):
+        assert 0 < black(full) / STRAYS**2 < 1.1 * black(small)
 
 
 def test_views_of_an_object_are_the_one_that_shows_it_largest_and_one_from_the_other_side():
