@@ -61,11 +61,13 @@ def certainty(
         if without:
             lines.append(f"{without} of {poses['photos']} photos have no pose and were left out.")
     if boxes := _boxes(run / "prepared/masks"):
-        width, height = (int(side) for side in np.median([box for _, box in boxes], axis=0))
+        magnified = prepared.get("magnified", 1.0)
+        width, height = (round(magnified * side) for side in np.median([box for _, box in boxes], axis=0))
         figures["object pixels"] = [width, height]
         finer = ": for more detail, add --downscale 1" if max(width, height) < SMALL else ""
         subject = "The object has" if len({class_id for class_id, _ in boxes}) == 1 else "Objects have"
-        lines.append(f"{subject} about {width} x {height} pixels in the photos as they were trained on{finer}.")
+        where = "close-ups" if magnified > 1 else "photos"
+        lines.append(f"{subject} about {width} x {height} pixels in the {where} that training saw{finer}.")
     if agreement is not None and (level != "sure" or (things is not None and things.found < things.asked)):
         lines += _next(again, agreement, masks)
     return Certainty(level, lines, figures)
@@ -97,11 +99,12 @@ def _next(again: str, agreement: dict[str, Any], masks: Path | None) -> list[str
 
 
 def _boxes(masks: Path) -> list[tuple[int, tuple[int, int]]]:
-    """Return the class, and width and height of the bounding box in pixels, of every object in every mask."""
+    """Return the class, and width and height of the bounding box in pixels, of every object in every photo's mask."""
     from beags_plugin.labels.classes import read_id_mask
+    from beags_plugin.views.close_ups import CLOSE_UP
 
     boxes = []
-    for path in sorted(masks.rglob("*.png")):
+    for path in sorted(path for path in masks.rglob("*.png") if CLOSE_UP not in path.name):
         labels = read_id_mask(path)
         for class_id in np.setdiff1d(labels, [BACKGROUND, IGNORE]).tolist():
             rows, columns = np.nonzero(labels == class_id)

@@ -37,7 +37,7 @@ BEFORE = ("sample", "poses", "poses and masks", "base training")  # Stages befor
 PRESET, PRESET_OF_PHOTOS = "beags-tiny", "beags-fast"
 SIZE, DOWNSCALE = (640, 480), 2.5
 """Width and height of the generated photos, and their downscale factor in training."""
-GENERATED = ("--pipeline.datamanager.focus", "auto", "--pipeline.datamanager.dense-seeds", "off")
+GENERATED = ("--pipeline.datamanager.dense-seeds", "off")
 """Options of training on the generated photos."""
 
 

@@ -14,15 +14,13 @@ class PhaseSchedule:
     """Steps of the two phases: base is [0, base_steps), refinement [base_steps, base_steps + refine_steps).
 
     stated_for: length of the base for which the schedule's other steps are stated; 0 if they are stated for this one.
-    warm: the base starts from a trained scene and only polishes it. sharpened: share of refinement that grows Gaussians
-    of objects, from close-ups that the base has not seen.
+    warm: the base starts from a trained scene and only polishes it.
     """
 
     base_steps: int
     refine_steps: int
     stated_for: int = 0
     warm: bool = False
-    sharpened: float = 0.0
 
     @property
     def scale(self) -> float:
@@ -42,21 +40,12 @@ class PhaseSchedule:
         """Return whether ``step`` belongs to refinement."""
         return step >= self.base_steps
 
-    def sharpening(self, step: int) -> bool:
-        """Return whether ``step`` belongs to the part of refinement that sharpens."""
-        return 0 <= step - self.base_steps < self.sharpened * self.refine_steps
-
     def progress(self, step: int) -> float:
-        """Return the position in the base's learning-rate schedule, 0..1; refinement from 0.9, polish from 0.5.
-
-        While refinement sharpens, the position goes from 0.5 to 0.9.
-        """
+        """Return the position in the base's learning-rate schedule, 0..1; refinement from 0.9, polish from 0.5."""
         if not self.refining(step):
             first = POLISH_SCHEDULE_FROM if self.warm else 0.0
             return first + (1.0 - first) * step / max(self.base_steps, 1)
         done = (step - self.base_steps) / max(self.refine_steps, 1)
-        if self.sharpening(step):
-            return POLISH_SCHEDULE_FROM + (REFINE_SCHEDULE_FROM - POLISH_SCHEDULE_FROM) * done / self.sharpened
         return REFINE_SCHEDULE_FROM + (1.0 - REFINE_SCHEDULE_FROM) * min(done, 1.0)
 
 

@@ -43,6 +43,12 @@ class AgreementReport:
         known = [1.0 - error for error in self.errors if error is not None]
         return float(np.mean(known)) if known else 1.0
 
+    def of_first(self, count: int) -> AgreementReport:
+        """Return what it did to the first ``count`` views."""
+        first = slice(count)
+        overruled = [view for view in self.overruled if view < count]
+        return AgreementReport(self.errors[first], overruled, self.changed[first], self.doubtful[first], self.things)
+
     def to_json(self, names: Sequence[str]) -> dict[str, Any]:
         """Return plain values for JSON; names: of the views."""
         rows = zip(names, self.errors, self.changed, self.doubtful, strict=True)

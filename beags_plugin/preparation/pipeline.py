@@ -118,6 +118,7 @@ def prepare(
     seed: int = 0,
     scale: float = 1.0,
     stage: Stage = lambda name: nullcontext(),
+    photos: int | None = None,
 ) -> Preparation:
     """Make labels consistent, assign classes, build the voxel grids.
 
@@ -126,6 +127,7 @@ def prepare(
     class_names: id to name with background (0), in any range: the stages work on ranks.
     background_voxels: False drops the voxels of the background, for losses that ignore it.
     scale: units of the scene's frame per unit of the input poses'.
+    photos: how many of the views, the first ones, are whole photos; close-ups of them follow. None: all.
     Depth images lie in temporary files, so memory grows by the compressed labels of a view and by voxels only. The
     exception is "pairwise", which reads depth and labels of all views into memory.
     Raises ``UserError`` if no mask names an object.
@@ -141,6 +143,7 @@ def prepare(
     if config.agree:
         with timed(seconds, "agreement"):
             maps, agreement = agree(surfels, cameras, maps, known, rasterizer, settings, stage)
+            agreement = agreement.of_first(len(maps) if photos is None else photos)
         summary.append(f"agreement: {agreement.sentence()}")
     with timed(seconds, "reprojection"):
         masks = _consistent_masks(surfels, cameras, maps, known, rasterizer, settings, config, stage, summary)

@@ -22,6 +22,7 @@ from beags_plugin.views.photo_files import Box, PhotoFiles
 from beags_plugin.views.split_photos import resize_area
 from beags_plugin.views.views import View
 
+CLOSE_UP = "-close-up-"  # A close-up's name is its photo's, this, and a number.
 DETAIL = 4.0
 """Pixels stored of all close-ups of a photo, over the pixels of a step."""
 MOST_BYTES = 1e9
@@ -68,13 +69,14 @@ class CloseUps:
     """The close-ups of all training photos, and which of them a step sees.
 
     names: of the photos. pixels: of a step. share: of the steps that see a close-up, if their photo has one. seed: it
-    decides together with the step which close-up is seen.
+    decides together with the step which close-up is seen. gain: magnification of objects over whole photos, in the
+    mean.
     """
 
     def __init__(
-        self, close_ups: Sequence[CloseUp], names: Sequence[str], pixels: int, share: float, seed: int
+        self, close_ups: Sequence[CloseUp], names: Sequence[str], pixels: int, share: float, seed: int, gain: float
     ) -> None:
-        self.pixels, self.share, self.seed = pixels, share, seed
+        self.pixels, self.share, self.seed, self.gain = pixels, share, seed, gain
         self.close_ups: list[CloseUp] = []
         self._of_photo: dict[int, list[CloseUp]] = defaultdict(list)
         self._photos = names
@@ -86,7 +88,7 @@ class CloseUps:
         self.close_ups += close_ups
         for each in close_ups:
             self._of_photo[each.photo].append(each)
-            self.names.append(f"{self._photos[each.photo]}-close-up-{len(self._of_photo[each.photo])}")
+            self.names.append(f"{self._photos[each.photo]}{CLOSE_UP}{len(self._of_photo[each.photo])}")
 
     def blind(self) -> list[int]:
         """Return the photos without a close-up."""

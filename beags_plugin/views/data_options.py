@@ -93,9 +93,10 @@ class ViewOptions:
     """Whether a base begins with more seed points, on whose depth several photos agree; auto: where there are at most
     50 photos, of which features give few points. It takes one or two seconds a photo."""
     begins: Suppress[bool] = False  # whether a base begins with seed points; the pipeline sets it
-    focus: str = "off"
+    focus: str = "auto"
     """Share of the steps that see close-ups of objects, at up to the size of the photos' files, and not whole photos.
-    off: none; auto: half, where masks cover less than 40 % of the photos' pixels and photos are scaled down."""
+    off: none; auto: half, in a run with a base of its own from seed points, if masks cover less than 40 % of the
+    photos' pixels and photos are scaled down."""
     photos: Literal["all", "objects"] = "all"
     """What training sees of the photos: all, or objects, their pixels alone before a random colour (turntables)."""
 

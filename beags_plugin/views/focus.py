@@ -11,6 +11,7 @@ from itertools import combinations
 
 import cv2
 import numpy as np
+from rich.progress import track
 from torch import Tensor
 
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE, count_ids
@@ -101,8 +102,9 @@ def focused(
     with ThreadPoolExecutor(max_workers=2) as pool:
         aimed = [photo for photo, aim in aims.items() if aim.boxes]
         read = pool.map(lambda photo: read_close_ups(files, photo, aims[photo].boxes, kept), aimed)
-        close_ups = [close_up for of_photo in read for close_up in of_photo]
-    return CloseUps(close_ups, names, pixels, share, seed)
+        photos = track(read, "Reading close-ups", total=len(aimed), transient=True)
+        close_ups = [close_up for of_photo in photos for close_up in of_photo]
+    return CloseUps(close_ups, names, pixels, share, seed, gain)
 
 
 def aim_by(close_ups: CloseUps, files: PhotoFiles, labels: Sequence[Tensor]) -> None:

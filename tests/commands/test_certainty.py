@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,6 +22,7 @@ from beags_plugin.masks.check.contradictions import Contradiction
 from beags_plugin.objects import check_masks
 from beags_plugin.system.digests import folder_digest
 from beags_plugin.system.errors import UserError
+from beags_plugin.views.close_ups import CLOSE_UP
 
 
 def write_run(folder: Path, agreement: float | None, overruled: list[str]) -> Path:
@@ -48,6 +50,14 @@ def test_the_words_follow_from_what_the_masks_agree_on(tmp_path, agreement, over
     assert ("beags demo --pick --fresh" in said) == (level in ("fairly sure", "not sure"))
     assert "40 x 20 pixels" in said and "--downscale 1" in said
     assert found.figures["object pixels"] == [40, 20]
+
+
+def test_the_size_is_that_in_close_ups_where_training_saw_some(tmp_path):
+    run = write_run(tmp_path / "run", None, [])
+    (run / "prepared/report.json").write_text(json.dumps({"magnified": 4.5}))
+    shutil.copy(run / "prepared/masks/a.png", run / f"prepared/masks/a{CLOSE_UP}1.png")
+    found = certainty(run, tmp_path)
+    assert found.figures["object pixels"] == [180, 90] and "--downscale" not in " ".join(found.lines)
 
 
 def test_the_size_is_that_of_one_object_where_there_are_several(tmp_path):

@@ -36,7 +36,7 @@ def write_objects(root, *boxes, views=9, size=(160, 120)) -> None:
 
 
 def focused(root, focus: object = "auto", downscale=4.0, **options):
-    data = manager(root, {"downscale_factor": downscale}, focus=str(focus), **options)
+    data = manager(root, {"downscale_factor": downscale}, focus=str(focus), **{"begins": True, **options})
     data.focus()
     return data
 
@@ -191,6 +191,12 @@ def test_other_labels_take_the_place_of_the_masks(tmp_path):
         _, batch = data.next_train(step)
         assert batch["present"] == [5] and set(batch["labels"].unique().tolist()) <= {5, IGNORE}
     assert torch.equal(data.close_up_views()[0].labels, new[0])
+
+
+def test_auto_leaves_a_scene_alone_that_others_have_begun(tmp_path):
+    write_objects(tmp_path, (40, 30, 80, 60))
+    assert focused(tmp_path, "auto", begins=False).close_ups is None
+    assert focused(tmp_path, 0.5, begins=False).close_ups is not None
 
 
 @pytest.mark.parametrize("focus", [1.5, -0.1, "on", float("nan")])

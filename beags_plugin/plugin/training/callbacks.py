@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, cast
 
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
@@ -20,8 +19,6 @@ from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.views.held_out_views import HeldOutViews
 
-SHARPENED = 0.5  # Share of refinement that sharpens, if the base has seen no close-ups.
-
 
 def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
     """Build the callbacks of one run, in the order in which nerfstudio calls them."""
@@ -31,7 +28,7 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
     adam = cast(SceneOptimizer, attributes.optimizers).adam
     model.seed = trainer.config.machine.seed
     model.extent = camera_extent(datamanager.train_dataset.cameras.camera_to_worlds).to(model.device)
-    focus(model, datamanager)
+    datamanager.focus()
     densifier = Densifier(model, adam, datamanager)
     switch = RefinementSwitch(model, trainer, datamanager)
     switch.check()
@@ -71,13 +68,6 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
         TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before),
         TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after),
     ]
-
-
-def focus(model: SceneModel, datamanager: BeagsDataManager) -> None:
-    """Show close-ups of objects to training; a refinement whose base has seen none sharpens the objects."""
-    datamanager.focus()
-    if datamanager.close_ups is not None and model.schedule.base_steps == 0:
-        model.schedule = replace(model.schedule, sharpened=SHARPENED)
 
 
 def _curves(model: SceneModel, trainer: TrainingRun, datamanager: BeagsDataManager) -> Curves | None:

@@ -11,14 +11,12 @@ from torch.optim import Adam
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import Densified, GradientStatistics, densify, length_units, reset_opacity
 from beags_plugin.core.free_space import nearest_depths, reaches_before_camera
-from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.plugin.training.near_growth import NearVotes, on_objects, shared_pixels
 from beags_plugin.plugin.training.scene_edits import edit_scene, move_adam_state
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.system.progress import say
 
-SHARPEN_EVERY = 50  # Steps between two rounds of growth in a refinement that sharpens.
 MOST_FREED = 0.2  # Largest share of Gaussians to remove: with more, seed points are too few to bound near surfaces.
 
 
@@ -61,12 +59,7 @@ class Densifier:
     def before_step(self, step: int) -> None:
         """Turn on screen gradients for the step if the scene still grows."""
         model, schedule = self.model, self.model.schedule
-        of_base = not schedule.warm and step + 1 < min(self.config.stop, schedule.base_steps)
-        model.growing = of_base or self._sharpens(step)
-
-    def _sharpens(self, step: int) -> bool:
-        model = self.model
-        return model.schedule.sharpening(step) and not model.frozen and model.own_training is None
+        model.growing = not schedule.warm and step + 1 < min(self.config.stop, schedule.base_steps)
 
     def after_step(self, step: int) -> None:
         """Gather statistics; densify, free the space before cameras and reset opacities at their steps."""
@@ -74,33 +67,31 @@ class Densifier:
         growing = self.model.growing and self.model.last_render is not None
         if growing:
             self._gather()
-            if config.grows_at(done) if step < schedule.base_steps else done % SHARPEN_EVERY == 0:
+            if config.grows_at(done):
                 self._densify(done)
         if not schedule.warm and config.frees_at(done, schedule.base_steps):
             self._free_cameras()
-        if growing and step < schedule.base_steps and config.resets_at(done):
+        if growing and config.resets_at(done):
             self._reset_opacity()
 
     def _gather(self) -> None:
         last = self.model.last_render
         if last is not None and last.screen_shift is not None and last.screen_shift.grad is not None:
             gradient, visible = last.screen_shift.grad.norm(dim=-1), last.render.visible
-            if self.near is not None and last.close_up and last.labels is not None:
+            if self.near is not None and last.labels is not None:
                 inside = on_objects(self.model.surfels().means.detach(), last.camera, last.labels)
-                self.near.add(inside, visible)
-                visible = visible & inside
+                if last.close_up:
+                    visible = visible & inside
+                else:
+                    self.near.add(inside, visible)
             self.statistics.add(gradient, visible)
 
     def _densify(self, step: int) -> None:
         model = self.model
         surfels = model.surfels().detach()
         units = length_units(surfels.means, self.camera_centers, float(model.extent), self.config)
-        gradient, apart = self.statistics.mean(), None
-        if self.near is not None:
-            apart = self.near.near(), self.most_near
-        if model.schedule.refining(step - 1):
-            of_objects = model.class_ids != BACKGROUND
-            gradient, apart = torch.where(of_objects, gradient, 0.0), (of_objects, self.most_near)
+        apart = None if self.near is None else (self.near.near(), self.most_near)
+        gradient = self.statistics.mean()
         self._edit(densify(surfels, gradient, units, self.config, step, model.generator(step), apart))
 
     def _free_cameras(self) -> None:

@@ -8,8 +8,9 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 
-MOST = 0.5
-"""A Gaussian is near if more than this share of the close-ups that show it show it on an object."""
+MOST = 0.85
+"""A Gaussian is near if more than this share of the whole photos that show it show it on an object. What stands behind
+an object is also on it in half of the photos, and in nearly all close-ups, hidden or not."""
 
 MORE = 1.2
 """Bound of all Gaussians with close-ups, in units of the bound without; more would take too long."""
@@ -25,19 +26,19 @@ def shared_pixels(whole: int, of_objects: int) -> tuple[int, int]:
 
 
 class NearVotes:
-    """For each of N Gaussians, the number of close-ups that show it, and of those that show it on an object."""
+    """For each of N Gaussians, the number of whole photos that show it, and of those that show it on an object."""
 
     def __init__(self, count: int, device: torch.device | str = "cpu") -> None:
         self.shown = torch.zeros(count, device=device)
         self.inside = torch.zeros(count, device=device)
 
     def add(self, inside: Tensor, visible: Tensor) -> None:
-        """Add a close-up. inside: [N] bool of ``on_objects``. visible: [N] bool."""
+        """Add a photo. inside: [N] bool of ``on_objects``. visible: [N] bool."""
         self.shown += visible.to(self.shown)
         self.inside += (visible & inside).to(self.inside)
 
     def near(self) -> Tensor:
-        """Return [N] bool, the Gaussians whose centre most close-ups show on an object."""
+        """Return [N] bool, the Gaussians whose centre nearly all photos show on an object."""
         return self.inside > MOST * self.shown
 
     def of(self, source: Tensor) -> NearVotes:

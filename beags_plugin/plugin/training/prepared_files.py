@@ -21,12 +21,13 @@ from beags_plugin.system.whole_files import write_text_atomically, write_whole
 
 
 def save_prepared(
-    prepared: Preparation, names: list[str], folder: Path, background_voxels: bool, fit: Residuals | None = None
-) -> None:
+    prepared: Preparation, names: list[str], folder: Path, background_voxels: bool, fit: Residuals | None = None,
+    magnified: float = 1.0,
+) -> None:  # fmt: skip
     """Write what a resumed refinement needs; grid.pt comes last, as its presence marks the rest as complete.
 
     background_voxels: whether the grid kept those that there are. fit: of the base to the photos, for the report; None
-    if it was not measured.
+    if it was not measured. magnified: objects in close-ups, over whole photos.
     """
     with writing(folder):
         (folder / "grid.pt").unlink(missing_ok=True)
@@ -46,9 +47,10 @@ def save_prepared(
         "seconds": prepared.seconds,
         "peak_memory_mb": peak_memory_mb(),
         "background_voxels": background_voxels,
+        "magnified": magnified,
     }
     if prepared.agreement is not None:
-        report["agreement"] = prepared.agreement.to_json(names)
+        report["agreement"] = prepared.agreement.to_json(names[: len(prepared.agreement.errors)])
     if fit is not None:
         report["residuals"] = {**vars(fit), "contradict": fit.contradict}
     write_text_atomically(json.dumps(report, indent=2), folder / PREPARATION_REPORT)

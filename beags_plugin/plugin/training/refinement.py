@@ -201,6 +201,7 @@ class RefinementSwitch:
                     seed=model.seed,
                     scale=self._scale(),
                     stage=progress_bar,
+                    photos=len(whole),
                 )
             for line in prepared.summary:
                 say(f"  {line}")
@@ -211,7 +212,8 @@ class RefinementSwitch:
             if fit is not None and fit.contradict:
                 say(fit.sentence(), warning=True)
             names = [view.name for view in views]
-            save_prepared(prepared, names, self.trainer.base_dir / PREPARED, self._background_voxels(), fit)
+            folder = self.trainer.base_dir / PREPARED
+            save_prepared(prepared, names, folder, self._background_voxels(), fit, self.datamanager.magnified)
             if prepared.members is not None:  # Set after base/ is written, which holds the classes alone.
                 model.take_members(prepared.members)
             self._start(prepared.grid, prepared.labels)

@@ -88,13 +88,19 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
     def focus(self) -> None:
         """Show close-ups of objects to training from here on, if the option ``focus`` says so."""
         config, names = self.config, unique_names(self.train_dataset.image_filenames)
+        unknown_base = config.focus == "auto" and not config.begins
         self.close_ups = focused(
-            config.focus,
+            "off" if unknown_base else config.focus,
             self.files["train"],
             partial(self._labels, "train", original=True),
             names,
             config.train_cameras_sampling_seed,
         )
+
+    @property
+    def magnified(self) -> float:
+        """How much larger close-ups show objects than whole photos, in the mean; 1 without close-ups."""
+        return 1.0 if self.close_ups is None else self.close_ups.gain
 
     def _add_dense_seeds(self) -> None:
         """Add seed points on which photos agree, if the option says so and there are points to begin with."""

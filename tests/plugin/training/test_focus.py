@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 import torch
 
 pytest.importorskip("nerfstudio")
 
-from resumed_runs import assert_same_run, checkpoint_of, interrupted, kill_at, resume_to_end, run_to_end, short_config
+from resumed_runs import assert_same_run, interrupted, kill_at, resume_to_end, run_to_end, short_config
 from run_folders import write_drawn_scene, write_scene
 
-FOCUSED = {"pipeline.datamanager.focus": "0.5", "pipeline.datamanager.dataparser.downscale_factor": 2.0}
+from beags_plugin.views.close_ups import CLOSE_UP
+
+FOCUSED = {
+    "pipeline.datamanager.focus": "0.5",
+    "pipeline.datamanager.dataparser.downscale_factor": 2.0,
+    "pipeline.model.prepare.agree": True,
+}
 
 
 @pytest.fixture
@@ -43,24 +51,19 @@ def test_the_number_of_threads_is_no_matter(focused, tmp_path):
 
 def test_close_ups_get_consistent_masks_of_their_own(focused):
     masks = {path.stem for path in (focused / "run/prepared/masks").iterdir()}
-    near = {name for name in masks if "-close-up-" in name}
-    assert near and {name.partition("-close-up-")[0] for name in near} <= masks - near
+    near = {name for name in masks if CLOSE_UP in name}
+    assert near and {name.partition(CLOSE_UP)[0] for name in near} <= masks - near
+    report = json.loads((focused / "run/prepared/report.json").read_text())
+    assert {each["view"] for each in report["agreement"]["views"]} == masks - near and report["magnified"] > 1.2
 
 
-def test_refinement_sharpens_a_base_that_saw_no_close_ups(tmp_path):
-    """Gaussians of objects grow, those of the background do not, and nothing grows without focus."""
+def test_close_ups_belong_to_runs_with_a_base_of_their_own(tmp_path, capsys):
     data, base = tmp_path / "data", tmp_path / "base"
     write_drawn_scene(data)
-    plain = {**FOCUSED, "pipeline.datamanager.focus": "off", "pipeline.model.densify.stop": 0}
-    run_to_end(short_config(data, base, **plain, **{"pipeline.model.refine_steps": 0}))
-
-    def refined(name: str, focus: str) -> dict:
-        options = {**FOCUSED, "pipeline.datamanager.focus": focus, "load_dir": base / "nerfstudio_models"}
-        steps = {"pipeline.model.base_steps": 0, "pipeline.model.refine_steps": 104}
-        steps["optimizers.opacities.optimizer.lr"] = 0.01
-        run_to_end(short_config(data, tmp_path / name, **options, **steps))
-        return checkpoint_of(tmp_path / name)["pipeline"]
-
-    off, on = refined("off", "off"), refined("on", "0.5")
-    counts = [torch.bincount(state["_model.class_ids"].clamp_max(1), minlength=2).tolist() for state in (off, on)]
-    assert counts[1][1] > 1.1 * counts[0][1] and counts[1][0] <= counts[0][0]
+    auto = {**FOCUSED, "pipeline.datamanager.focus": "auto"}
+    run_to_end(short_config(data, base, **auto, **{"pipeline.model.refine_steps": 0}))
+    assert "of the steps see close-ups" in capsys.readouterr().out.replace("\n", " ")
+    options = {**auto, "load_dir": base / "nerfstudio_models", "pipeline.model.base_steps": 0}
+    run_to_end(short_config(data, tmp_path / "refined", **options))
+    assert "of the steps see close-ups" not in capsys.readouterr().out.replace("\n", " ")
+    assert not [path for path in (tmp_path / "refined/prepared/masks").iterdir() if CLOSE_UP in path.name]
