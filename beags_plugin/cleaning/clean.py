@@ -14,6 +14,7 @@ from beags_plugin.core.surfels import Surfels
 
 OUTSIDE = 0.2  # share of a Gaussian's weight outside the masks above which it may be left out
 CHIP = 0.005  # share of an object's weight inside its masks below which a part far from it may be a chip
+SPECK = 0.002  # the same share below which it is a chip whatever the masks say
 CHIP_SUPPORT = 2.0  # least ratio of a part's weight inside the masks to that outside and hidden, unless it is a chip
 FAR = 0.1  # distance of a chip from all else, over the object's longest side
 MOST = 0.5  # largest share of an object's Gaussians to leave out; beyond it, masks and object contradict each other
@@ -47,7 +48,8 @@ def clean(part: Surfels, class_id: int, views: MaskedViews) -> tuple[Tensor, Lef
     outside the masks, where nothing hides it; it is left out unless that opens more pixels in the masks than it clears
     beside them. Of the rest, connected parts (``connected_parts``) are left out if they have no more weight inside the
     masks than outside; the part with the most weight inside stays. Parts far from it with hardly any of the weight
-    inside, and less than twice as much as outside and hidden, are errors that a few masks share: they are left out too.
+    inside, and less than twice as much as outside and hidden, are errors that a few masks share: they are left out too,
+    as is a part far from it with next to none.
 
     part: M Gaussians of class ``class_id``, in the frame of the views. If more than half of them would be left out,
     none is. Returns indices [K] int64, ascending, and the numbers left out.
@@ -66,7 +68,8 @@ def clean(part: Surfels, class_id: int, views: MaskedViews) -> tuple[Tensor, Lef
     dropped[left[loose[parts]]] = True
     left, parts, (within, beyond, behind) = _weighed_parts(part, evidence, dropped, FAR)
     if len(within):
-        chips = (within < CHIP * within.sum()) & (within < CHIP_SUPPORT * (beyond + behind))
+        unsupported = (within < CHIP * within.sum()) & (within < CHIP_SUPPORT * (beyond + behind))
+        chips = unsupported | (within < SPECK * within.sum())
         chips[within.argmax()] = False
         dropped[left[chips[parts]]] = True
     if dropped.sum() > MOST * len(part):

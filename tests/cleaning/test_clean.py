@@ -134,6 +134,13 @@ def test_a_chip_that_a_few_masks_take_for_the_object_is_left_out():
     assert len(clean(near, 1, views(near, ones(near), near))[0]) == 206
 
 
+def test_a_speck_far_from_the_object_is_left_out_whatever_the_masks_say():
+    body = ball(radius=0.8)
+    far, near = (joined(body, ball((x, 0.0, 0.0), 0.01, 1)) for x in (1.3, 0.85))
+    for scene, kept in ((far, 200), (near, 201)):
+        assert len(clean(scene, 1, views(scene, ones(scene), scene))[0]) == kept
+
+
 def test_a_disc_without_which_the_object_had_a_hole_stays():
     body = ball()
     body = body[body.means[:, 2] < 0.35]
