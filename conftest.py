@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,10 @@ from hypothesis import settings
 from shared_folders import shared_folder
 
 from beags_plugin.ops import extension
+from beags_plugin.plugin.views.ns_programs import leave_out_other_methods
+
+if find_spec("nerfstudio"):
+    leave_out_other_methods()  # in a process with the modules of all tests, nerfstudio's start took 14 seconds
 
 settings.register_profile("beags", deadline=None)  # a busy machine is no failure
 settings.load_profile("beags")
