@@ -106,7 +106,7 @@ def _winding_numbers(mesh: Mesh, low: np.ndarray, cell: float, shape: tuple[int,
     corners = list(np.ndindex(2, 2, 2))
     shares = np.stack([np.prod(np.where(corner, part, 1.0 - part), axis=1) for corner in corners])
     flat = np.stack([np.ravel_multi_index(tuple((first + corner).T), shape) for corner in corners])
-    half = tuple(int(next_fast_len(side, real=True)) for side in shape)
+    half: Any = tuple(next_fast_len(side, real=True) for side in shape)
     places = [np.arange(2 * side) for side in half[:2]]
     mirrored = [np.minimum(place, 2 * side - place) for place, side in zip(places, half, strict=False)]
     total: Any = 0.0
@@ -119,8 +119,9 @@ def _winding_numbers(mesh: Mesh, low: np.ndarray, cell: float, shape: tuple[int,
         if axis < 2:  # It is odd along its own axis.
             kernel *= np.expand_dims(np.where(places[axis] > half[axis], -1.0, 1.0), tuple({0, 1, 2} - {axis}))
         total = total + transform * kernel
-    total = ifft(ifft(-1j * total, axis=0)[: shape[0]], axis=1)[:, : shape[1]]
-    numbers: Any = irfft(total, 2 * half[2], axis=2)
+    total = ifft(-1j * total, axis=0)
+    total = ifft(total[: shape[0]], axis=1)
+    numbers: Any = irfft(total[:, : shape[1]], 2 * half[2], axis=2)
     return numbers[:, :, : shape[2]]
 
 
@@ -134,7 +135,7 @@ def _kernel_transform(half: tuple[int, ...], axis: int) -> np.ndarray:
     from scipy.fft import dct, dst
 
     steps: Any = np.meshgrid(*(np.arange(side + 1, dtype=np.float32) for side in half), indexing="ij", sparse=True)
-    squared = sum(step * step for step in steps)
+    squared: Any = sum(step * step for step in steps)
     squared[0, 0, 0] = np.inf
     found: Any = -steps[axis] / (4.0 * np.pi * squared * np.sqrt(squared))
     for each in range(3):
