@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import os
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 import torch
-from every_backend import rasterizer  # noqa: F401
+from every_backend import compiled, rasterizer  # noqa: F401
 from hypothesis import settings
 from shared_folders import shared_folder
 
 from beags_plugin.ops import extension
+from beags_plugin.plugin.views.ns_programs import leave_out_other_methods
+from beags_plugin.sample import desk
+
+if find_spec("nerfstudio"):
+    leave_out_other_methods()  # in a process with the modules of all tests, nerfstudio's start took 14 seconds
 
 settings.register_profile("beags", deadline=None)  # a busy machine is no failure
 settings.load_profile("beags")
@@ -77,6 +83,26 @@ def short_run(shared):
         run_to_end(short_config(write_scene(folder / "data"), folder / "run"))
 
     return shared("short_run", train)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def coarse_light():
+    """Measure the light of generated desks at fewer points: that took most of a small sample's time.
+
+    Yields the product's own distances of those points, by their names.
+    """
+    own = {name: value for name, value in vars(desk).items() if name.startswith("SPACING_")}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in own.items():
+            patch.setattr(desk, name, 4.0 * value)
+        yield own
+
+
+@pytest.fixture
+def fine_light(coarse_light, monkeypatch):
+    """The light of generated desks as users get it."""
+    for name, value in coarse_light.items():
+        monkeypatch.setattr(desk, name, value)
 
 
 @pytest.fixture(params=["torch", "compiled"])

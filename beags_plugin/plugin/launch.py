@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from beags_plugin.options.run_format import CONFIG_FILE
+from beags_plugin.plugin.views.ns_programs import leave_out_other_methods
 from beags_plugin.runs.layout import EXTRACTION_FILE, REPORT_FILE
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.pasted import quoted
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 def train(config: BeagsTrainerConfig) -> None:
     """Run the training of ``config`` into its ``run_dir``; raises ``UserError`` where ``ns-train`` would end."""
+    leave_out_other_methods()
     from nerfstudio.scripts.train import main
 
     _complete(lambda: main(config), config)
@@ -32,6 +34,7 @@ def resume(
     data: folder of the photos, if they were moved. Without a checkpoint the training starts from the beginning. Raises
     ``UserError`` for another folder and for a complete run.
     """
+    leave_out_other_methods()
     from nerfstudio.scripts.train import launch, train_loop
 
     from beags_plugin.plugin.options.machine import check_machine

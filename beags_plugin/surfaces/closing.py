@@ -17,7 +17,7 @@ from beags_plugin.surfaces.fusion import Mesh
 from beags_plugin.surfaces.surface import area_vectors, corner_weights, in_voxels, surface_of
 
 MOST_CELLS = 128
-"""Largest number of cells along the longest side; the Fourier transform of twice as many takes about 1 GB."""
+"""Largest number of cells along the longest side; the Fourier transform of twice as many takes about half a GB."""
 _MARGIN = 4  # cells around the surface
 _NEAR = 1.5  # distance in cells from the given surface below which a vertex is moved onto it; others are invented
 _ONTO = 0.95  # share of the way to the surface; the whole way would merge vertices at a rim
@@ -98,28 +98,54 @@ def _winding_numbers(mesh: Mesh, low: np.ndarray, cell: float, shape: tuple[int,
 
     Each face is a dipole, distributed over the corners of its cell; the sum over all dipoles is a convolution.
     """
-    from scipy.fft import irfftn, next_fast_len, rfftn
+    from scipy.fft import fft, ifft, irfft, next_fast_len, rfft
 
-    dipoles = np.zeros((3, *shape), np.float32)
     at = (mesh.vertices[mesh.faces].mean(axis=1) - low) / cell
     first = np.floor(at).astype(np.int64)
     part, strength = at - first, area_vectors(mesh) / cell**2
-    for corner in np.ndindex(2, 2, 2):
-        share = np.prod(np.where(corner, part, 1.0 - part), axis=1)
-        flat = np.ravel_multi_index(tuple((first + corner).T), shape)
-        for axis in range(3):
-            dipoles[axis] += np.bincount(flat, share * strength[:, axis], math.prod(shape)).reshape(shape)
-    size: Any = tuple(next_fast_len(2 * side - 1, real=True) for side in shape)
-    steps: Any = np.meshgrid(*(np.fft.fftfreq(side, 1.0 / side).astype(np.float32) for side in size), indexing="ij")
-    distance = np.sqrt(sum(step * step for step in steps))
-    distance[0, 0, 0] = np.inf  # A dipole has no effect at its own position.
+    corners = list(np.ndindex(2, 2, 2))
+    shares = np.stack([np.prod(np.where(corner, part, 1.0 - part), axis=1) for corner in corners])
+    flat = np.stack([np.ravel_multi_index(tuple((first + corner).T), shape) for corner in corners])
+    half: Any = tuple(next_fast_len(side, real=True) for side in shape)
+    places = [np.arange(2 * side) for side in half[:2]]
+    mirrored = [np.minimum(place, 2 * side - place) for place, side in zip(places, half, strict=False)]
     total: Any = 0.0
     for axis in range(3):
-        kernel = -steps[axis] / (4.0 * np.pi * distance**3)  # The steps lead from the point to the dipole.
-        transform: Any = rfftn(dipoles[axis], size)
-        total = total + transform * rfftn(kernel)
-    numbers: Any = irfftn(total, size)
-    return numbers[tuple(slice(side) for side in shape)]
+        dipoles = np.bincount(flat.ravel(), (shares * strength[:, axis]).ravel(), math.prod(shape))
+        # One axis after the other: most lines of the padded grid are empty at first, and not needed in the end.
+        transform: Any = rfft(dipoles.reshape(shape).astype(np.float32), 2 * half[2], axis=2)
+        transform = fft(fft(transform, 2 * half[1], axis=1), 2 * half[0], axis=0)
+        kernel = _kernel_transform(half, axis)[np.ix_(*mirrored)]
+        if axis < 2:  # It is odd along its own axis.
+            kernel *= np.expand_dims(np.where(places[axis] > half[axis], -1.0, 1.0), tuple({0, 1, 2} - {axis}))
+        total = total + transform * kernel
+    total = ifft(-1j * total, axis=0)
+    total = ifft(total[: shape[0]], axis=1)
+    numbers: Any = irfft(total[:, : shape[1]], 2 * half[2], axis=2)
+    return numbers[:, :, : shape[2]]
+
+
+def _kernel_transform(half: tuple[int, ...], axis: int) -> np.ndarray:
+    """Return the Fourier transform of the field of a dipole along ``axis`` on a periodic grid, divided by -i.
+
+    half: half the places along each side. The field is odd along its axis and even along the others, so that sine and
+    cosine transforms of an eighth of the grid give an eighth of the frequencies, [half + 1] float32; the rest mirrors
+    them. The field steps lead from the point to the dipole, and a dipole has no effect at its own position.
+    """
+    from scipy.fft import dct, dst
+
+    steps: Any = np.meshgrid(*(np.arange(side + 1, dtype=np.float32) for side in half), indexing="ij", sparse=True)
+    squared: Any = sum(step * step for step in steps)
+    squared[0, 0, 0] = np.inf
+    found: Any = -steps[axis] / (4.0 * np.pi * squared * np.sqrt(squared))
+    for each in range(3):
+        if each != axis:
+            found = dct(found, type=1, axis=each)
+        else:
+            inner = (slice(None),) * axis + (slice(1, -1),)
+            found[inner] = dst(found[inner], type=1, axis=axis)
+            found[(slice(None),) * axis + ([0, -1],)] = 0.0
+    return found
 
 
 def _nearest(mesh: Mesh, points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

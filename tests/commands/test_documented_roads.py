@@ -63,6 +63,7 @@ class Reader:
         config.vis, config.run_dir = "tensorboard", self.folder / f"run_{len(self.runs)}"
         model, parser = config.model_config, config.data_config.dataparser
         model.base_steps, model.refine_steps = min(model.base_steps, 20), min(model.refine_steps, 2)
+        model.close_contacts = False  # that takes longer than all steps
         model.prepare, parser.num_random_points = type(model.prepare)(k=5), 300
         config.optimizers["opacities"]["optimizer"].lr = 0.5  # opaque after so few steps
         config.data_config.data = config.data or config.data_config.data  # ns-train does the same.

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -159,12 +160,16 @@ def splats(config, views) -> dict[tuple[str, str], Picture]:
 
 
 @pytest.fixture(scope="module")
-def written(config, tmp_path_factory) -> Path:
-    """Write meshes of both objects, in the world's frame and centred."""
-    folder = tmp_path_factory.mktemp("meshes")
-    for frame in ("world", "object"):
-        main(["export", "--load-config", str(config), "--all", "--format", "glb", "obj", "--resolution", "96",
-              "--truncation", "4", "--frame", frame, "--output", str(folder / frame)])  # fmt: skip
+def written(config, tmp_path_factory):
+    """A function that writes meshes of both objects once, in the world's frame or centred; it returns their folder."""
+
+    @cache
+    def folder(frame: str, *formats: str) -> Path:
+        found = tmp_path_factory.mktemp("meshes")
+        main(["export", "--load-config", str(config), "--all", "--format", *formats, "--resolution", "96",
+              "--truncation", "4", "--frame", frame, "--output", str(found)])  # fmt: skip
+        return found
+
     return folder
 
 
@@ -173,9 +178,10 @@ def written(config, tmp_path_factory) -> Path:
 @pytest.mark.parametrize("name", OBJECTS.values())
 @pytest.mark.slow("fuses and textures meshes as large as in use")
 def test_a_mesh_looks_like_its_splats(written, splats, views, name, suffix, frame):
-    mesh = read(written / f"{frame}/{name}.{suffix}")
+    folder = written(frame, "glb", "obj")
+    mesh = read(folder / f"{name}.{suffix}")
     if frame == "object":
-        objects = json.loads((written / frame / "manifest.json").read_text())["objects"]
+        objects = json.loads((folder / "manifest.json").read_text())["objects"]
         (center,) = (one["center"] for one in objects if one["name"] == name)
         assert not splats[name, views[4].name].alike(mesh.seen_by(views[4]))
         mesh = replace(mesh, vertices=mesh.vertices + center)
@@ -205,7 +211,7 @@ WRONG = {
 @pytest.mark.parametrize("mistake", WRONG)
 def test_a_wrong_mesh_does_not(written, splats, views, mistake):
     """The comparison above would catch each mistake, in every view."""
-    mesh = WRONG[mistake](read(written / "world/cup.glb"))
+    mesh = WRONG[mistake](read(written("world", "glb") / "cup.glb"))
     for view in views:
         if view.split == "test":
             assert not splats["cup", view.name].alike(mesh.seen_by(view)), view.name

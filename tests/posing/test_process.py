@@ -22,8 +22,16 @@ from beags_plugin.posing.process import REPORT, process
 from beags_plugin.system.reading.ply import read_ply_points
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_features():
+    """Find fewer features in each photo: matching them takes most of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(features, "MOST", 1000)
+        yield
+
+
 @pytest.fixture(scope="module")
-def posed(tmp_path_factory):
+def posed(few_features, tmp_path_factory):
     """Return the folder of a scene made by the command from twelve photos, and the true poses."""
     root = tmp_path_factory.mktemp("posed")
     given = write_photos(root / "photos", prefix="walk 1, ")  # phones give such names

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from cuda_backends import BACKENDS
 from raster_scenes import (
     CLASSES,
     OUTPUTS,
@@ -20,17 +19,7 @@ from raster_scenes import (
 )
 
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.rasterizers.native import NativeRasterizer
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
-
-
-@pytest.fixture(params=["native", *BACKENDS])
-def compiled(request):
-    """A compiled backend; skipped with the reason where it cannot run."""
-    backend = BACKENDS.get(request.param, NativeRasterizer)
-    if reason := backend.unavailable():
-        pytest.skip(f"{request.param}: {reason}")
-    return backend()
 
 
 def slivers():

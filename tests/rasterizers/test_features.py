@@ -51,12 +51,12 @@ def leaves_of(scene):
 
 @pytest.mark.parametrize("channels", [1, 2, 16, 17])
 @pytest.mark.parametrize("name", SCENES)
-def test_gradients_are_the_references(name, channels, rasterizer):
+def test_gradients_are_the_references(name, channels, compiled):
     scene, g = SCENES[name](), torch.Generator().manual_seed(5)
     features = torch.randn(len(scene.inputs.means), channels, generator=g, dtype=torch.float64)
     factors = torch.randn(scene.camera.height, scene.camera.width, channels, generator=g, dtype=torch.float64)
     found = []
-    for backend in (rasterizer, TorchRasterizer()):
+    for backend in (compiled, TorchRasterizer()):
         leaves = leaves_of(scene)
         inputs, those = replace(scene.inputs, **leaves), features.clone().requires_grad_()
         drawn = draw_features(backend, inputs, those, scene.camera, scene.settings)
@@ -64,7 +64,7 @@ def test_gradients_are_the_references(name, channels, rasterizer):
         found.append([drawn, *torch.autograd.grad((drawn * factors).sum(), [*leaves.values(), those])])
     assert all(error(a.detach(), b.detach()) < 1e-9 for a, b in zip(*found, strict=True))
     alone = features.clone().requires_grad_()
-    drawn = draw_features(rasterizer, scene.inputs, alone, scene.camera, scene.settings)
+    drawn = draw_features(compiled, scene.inputs, alone, scene.camera, scene.settings)
     assert error(torch.autograd.grad((drawn * factors).sum(), alone)[0], found[1][-1]) < 1e-9
 
 

@@ -29,20 +29,32 @@ OBJECTS = {  # files compiled for one instruction set: their namespace and a sym
     "build_avx2": ("beags::ops::avx2::", "table<beags::ops::OpKernels<float> >()::all"),
 }
 DRAW = """
-import sys; sys.path[:0] = sys.argv[3:]
-import torch
-from test_native_isa import draw
+import os, sys; sys.path[:0] = sys.argv[3:]
+import pytest, raster_scenes, torch
 from beags_plugin.rasterizers import native
-assert native.instruction_set() == sys.argv[1]
-torch.save(draw(), sys.argv[2])
+assert "beags_plugin._native" not in sys.modules
+for name in sys.argv[1].split(","):
+    if (child := os.fork()) == 0:
+        os.environ["BEAGS_ISA"] = name
+        from test_native_isa import draw
+        assert native.instruction_set() == name
+        torch.save(draw(), f"{sys.argv[2]}/{name}.pt")
+        os._exit(0)
+    os.waitpid(child, 0)
 """
+"""The instruction set is chosen once in each process: forks of one that has not loaded it save its start."""
 
 
-def run(isa, program, *args):
-    """A process of its own, as the instruction set is chosen once in each."""
-    environment = os.environ | {"BEAGS_ISA": isa}
+def run(program, *args, **environment):
     command = [sys.executable, "-c", program, *map(str, args)]
-    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    return subprocess.run(command, capture_output=True, text=True, env=os.environ | environment, check=False)
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """A folder with what each instruction set of this processor has drawn, NAME.pt, and what was said."""
+    folder = tmp_path_factory.mktemp("drawn")
+    return folder, run(DRAW, ",".join(native.instruction_sets()), folder, HERE, SUPPORT).stderr
 
 
 def draw():
@@ -75,12 +87,12 @@ def error(a, b):
 
 @needs_native
 @pytest.mark.parametrize("name", NAMES)
-def test_every_instruction_set_renders_the_same(name, tmp_path):
+def test_every_instruction_set_renders_the_same(name, drawn):
     if name not in native.instruction_sets():
         pytest.skip(f"{name} is not built or not in this processor")
-    done = run(name, DRAW, name, tmp_path / "drawn.pt", HERE, SUPPORT)
-    assert done.returncode == 0, done.stderr
-    for found, expected, band in zip(torch.load(tmp_path / "drawn.pt"), draw(), (1e-4, 1e-12), strict=True):
+    folder, said = drawn
+    assert (folder / f"{name}.pt").exists(), said
+    for found, expected, band in zip(torch.load(folder / f"{name}.pt"), draw(), (1e-4, 1e-12), strict=True):
         assert all(error(a, b) < band for a, b in zip(found, expected, strict=True))
 
 
@@ -98,7 +110,7 @@ for name in sys.argv[1:]:
     except UserError as error:
         print(error)
 """
-    done = run(names[0], program, *names)
+    done = run(program, *names, BEAGS_ISA=names[0])
     assert done.returncode == 0, done.stderr
     reported = done.stdout.splitlines()
     assert len(reported) == len(names)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -57,6 +58,16 @@ def test_of_equal_weights_the_nearer_counts(rasterizer):
     assert (found[:, 0] > 0).tolist() == [True, False, False]
 
 
+@cache
+def sorted_weights(backend: type, name: str) -> tuple[Tensor, Tensor]:
+    """Return the weights [H, W, N] of all surfels at all pixels, the nearest first, and that order [N]."""
+    scene = SCENES[name]()
+    depths = (scene.inputs.means @ scene.camera.viewmat[:3, :3].T)[:, 2]
+    order = depths.argsort(stable=True)
+    one_hot = torch.eye(len(depths), dtype=torch.float64)
+    return draw_features(backend(), scene.inputs, one_hot, scene.camera, scene.settings)[..., order], order
+
+
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize(("most", "within"), [(1, 100), (3, 100), (4, 9), (100, 100)])
 def test_scenes_are_those_of_sorted_weights(rasterizer, name, most, within):
@@ -65,11 +76,7 @@ def test_scenes_are_those_of_sorted_weights(rasterizer, name, most, within):
     inputs, count = scene.inputs, len(scene.inputs.means)
     expected = torch.zeros(count, CLASSES, dtype=torch.float64)
     if count:
-        depths = (inputs.means @ scene.camera.viewmat[:3, :3].T)[:, 2]
-        order = depths.argsort(stable=True)
-        one_hot = torch.eye(count, dtype=torch.float64)
-        weights = draw_features(rasterizer, inputs, one_hot, scene.camera, scene.settings)
-        by_depth = weights[..., order]
+        by_depth, order = sorted_weights(type(rasterizer), name)
         first = by_depth.where((by_depth > 0).cumsum(-1) <= within, torch.zeros_like(by_depth))
         values, places = first.topk(min(most, count), dim=-1)
         for class_id in range(CLASSES):

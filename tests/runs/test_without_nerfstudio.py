@@ -34,6 +34,8 @@ COMMANDS = [
 CALL = """
 import contextlib, io, json, sys
 from beags_plugin.commands.cli import main
+from beags_plugin.commands.doctor import backends
+backends.TRIAL = ""  # the doctor tries each rasterizer in a process of its own
 for words in json.loads(sys.argv[1]):
     with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
         main(words)

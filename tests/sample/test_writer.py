@@ -17,6 +17,7 @@ from beags_plugin.sample import FAMILIES, writer
 from beags_plugin.sample.writer import SampleConfig, is_sample, write_sample
 from beags_plugin.system.errors import UserError
 
+SMALL = {"width": 16, "height": 16, "num_train": 1, "num_test": 1, "num_points": 5, "antialias": 1}
 CLASSES = {"tabletop": 8, "desk": 7}  # number of classes, with the background
 
 
@@ -121,8 +122,7 @@ def test_same_config_gives_the_same_bytes_and_is_not_rebuilt(folder, config, tmp
 
 
 def test_another_config_replaces_a_sample(tmp_path):
-    small = {"width": 16, "height": 16, "num_train": 1, "num_test": 1, "num_points": 5, "antialias": 1}
-    first, second = SampleConfig(seed=0, **small), SampleConfig(seed=1, **small)
+    first, second = SampleConfig(seed=0, **SMALL), SampleConfig(seed=1, **SMALL)
     write_sample(tmp_path / "s", first)
     write_sample(tmp_path / "s", second)
     assert is_sample(tmp_path / "s", second) and not is_sample(tmp_path / "s", first)
@@ -130,8 +130,8 @@ def test_another_config_replaces_a_sample(tmp_path):
 
 
 @pytest.mark.parametrize("former", [False, True])
-def test_the_same_sample_by_another_program_meanwhile_is_kept(folder, config, tmp_path, former):
-    target = tmp_path / "s"
+def test_the_same_sample_by_another_program_meanwhile_is_kept(tmp_path, former):
+    target, small = tmp_path / "s", SampleConfig(**SMALL)
     if former:  # another sample is there, which both are to replace
         target.mkdir()
         (target / writer.SAMPLE_FILE).write_text("{}")
@@ -139,11 +139,11 @@ def test_the_same_sample_by_another_program_meanwhile_is_kept(folder, config, tm
     def other(done, total):
         if done == total:
             shutil.rmtree(target, ignore_errors=True)
-            shutil.copytree(folder, target)
+            write_sample(target, small)
             (target / "theirs").touch()
 
-    assert write_sample(target, config, progress=other) == target
-    assert (target / "theirs").exists() and is_sample(target, config)
+    assert write_sample(target, small, progress=other) == target
+    assert (target / "theirs").exists() and is_sample(target, small)
     assert list(tmp_path.iterdir()) == [target]
 
 
@@ -155,7 +155,7 @@ def test_what_a_user_puts_there_meanwhile_is_kept(tmp_path):
         (target / "thesis.txt").write_text("mine")
 
     with pytest.raises(UserError, match="cannot be written"):
-        write_sample(target, TINY, progress=user)
+        write_sample(target, SampleConfig(**SMALL), progress=user)
     assert (target / "thesis.txt").read_text() == "mine" and list(tmp_path.iterdir()) == [target]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
@@ -17,8 +18,12 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import CameraState
 from nerfstudio.viewer.viewer import Viewer
 from run_folders import write_prepared, write_scene, write_trained
+from viser import _gui_api, _gui_handles, _icons
 
 from beags_plugin.core.cameras import Camera, viewmat_from_opengl
+
+_gui_api.svg_from_icon = _gui_handles.svg_from_icon = cache(_icons.svg_from_icon)
+"""Viser lists an archive of thousands of icons for each one that it shows."""
 
 ALWAYS = {"rgb", "depth", "normal", "accumulation"}
 

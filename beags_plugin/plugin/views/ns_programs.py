@@ -78,11 +78,11 @@ def prepare_training() -> None:
         print(f"beags: {error}", file=sys.stderr)
         sys.exit(2)
     silence_libraries()
-    _leave_out_other_methods()
+    leave_out_other_methods()
 
 
-def _leave_out_other_methods() -> None:
-    """Skip nerfstudio's work at each start for methods other than the named one.
+def leave_out_other_methods() -> None:
+    """Skip nerfstudio's work at each start for methods other than ours.
 
     For every method that could be installed it walks over all modules of the process, and for one function of
     splatfacto it imports torch's compiler.

@@ -54,7 +54,7 @@ def rasterized(view, things):
 def test_masks_silhouettes_and_depth_are_those_of_projected_triangles(room):
     seed, made = room
     light = TracedLight(made, 4, 4)
-    for view in room_views(seed, 96, 72, 2, 1)[::2]:
+    for view in room_views(seed, 96, 72, 2, 1)[:1]:
         picture = render_view(made, light, view, 1)
         depth = rasterized(view, made.things)
         wrong = (np.isfinite(depth) != picture.silhouettes).sum()
@@ -82,12 +82,13 @@ def test_some_held_out_views_show_what_hardly_any_photo_shows(room):
     views = room_views(seed, 24, 18, 60, 12)
     photos = [view for view in views if view.split == "train"]
     x, y = np.indices((24, 18)).reshape(2, -1) + 0.5
-    shares = []
+    points = []
     for view in views:
         if view.split == "test":
             hits, _ = first_hits(made, view.center, directions := view.directions(x, y))
-            points = view.center + hits.t[:, None] * directions
-            shares.append(np.mean(sum(shown(made, photo, points) for photo in photos) < 3))
+            points.append(view.center + hits.t[:, None] * directions)
+    hardly = sum(shown(made, photo, np.concatenate(points)) for photo in photos) < 3
+    shares = hardly.reshape(len(points), -1).mean(axis=1)
     assert min(shares) < 0.02 and max(shares) > 0.15 and 0.03 < np.mean(shares) < 0.15
 
 
@@ -102,7 +103,7 @@ def shown(scene, view, points):
     return seen
 
 
-def test_light_that_the_desk_bakes_is_that_of_the_room():
+def test_light_that_the_desk_bakes_is_that_of_the_room(fine_light):
     made = make_desk(0)
     light, direct, views = DeskLight(made), TracedLight(made), desk_views(0, 96, 72, 5, 1)
     for view in views[::3]:

@@ -152,8 +152,8 @@ def test_the_seed_decides(family):
     assert all(few[2] < many[2] and few[3:] == many[3:] for few, many in zip(fewer, more, strict=True))
 
 
-def test_a_sample_has_it_in_training_masks_alone(family, tmp_path):
-    config = VariedSample(**{**vars(TINY), "width": 48, "height": 32, "family": family, "degradation": "none"})
+def test_a_sample_has_it_in_training_masks_alone(tmp_path):
+    config = VariedSample(**{**vars(TINY), "width": 48, "height": 32, "degradation": "none"})
     plain = write_sample(tmp_path / "plain", config)
     shared = write_sample(tmp_path / "shared", dataclasses.replace(config, shared_damage=SHARE))
     mild = write_sample(tmp_path / "mild", dataclasses.replace(config, shared_damage=SHARE, degradation="mild"))
@@ -162,7 +162,7 @@ def test_a_sample_has_it_in_training_masks_alone(family, tmp_path):
     assert before.keys() == now.keys() and "sample.json" in different
     train, _ = splits(plain)
     assert {"sample.json"} < different <= {"sample.json", *(f"masks/{stem}.png" for stem in train)}
-    classes = 1 + len(FAMILIES.get(family).scene(config.seed).things)
+    classes = 1 + len(FAMILIES.get(config.family).scene(config.seed).things)
     for stem in train:
         truth = grey(plain / f"ground_truth/masks/{stem}.png")
         assert np.array_equal(grey(plain / f"masks/{stem}.png"), truth)

@@ -160,7 +160,7 @@ def test_a_visitor_stands_in_some_training_photos_and_is_background(folders):
     assert files(alike, *kinds) == files(moved, *kinds)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_visitor_touches_no_object_and_no_camera(family, seed):
     made = FAMILIES.get(family)
     views = made.views(seed, 64, 48, 6, 1)
@@ -208,6 +208,5 @@ def test_differences_that_no_capture_has_are_refused(tmp_path, wrong, sentence):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("moved", [0, 5])
-def test_tracks_agree_with_exact_geometry(family, moved):
-    assert_tracks_agree(VariedSample(family=family, moved=moved))
+def test_tracks_agree_with_exact_geometry(family):
+    assert_tracks_agree(VariedSample(family=family, moved=5))

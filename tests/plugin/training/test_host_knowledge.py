@@ -11,11 +11,9 @@ from resumed_runs import STEPS, run_to_end, short_config
 
 from beags_plugin.labels.class_ids import objects_in
 from beags_plugin.losses.silhouette import SilhouetteLoss
-from beags_plugin.sample.writer import SampleConfig, write_sample
 
 
-def test_members_and_objects_are_those_of_every_step(tmp_path, monkeypatch):
-    write_sample(tmp_path / "data", SampleConfig(seed=3, width=48, height=36, num_train=7, num_test=2))
+def test_members_and_objects_are_those_of_every_step(short_run, tmp_path, monkeypatch):
     value, seen = SilhouetteLoss.value, []
 
     def checked(self, inputs):
@@ -26,7 +24,7 @@ def test_members_and_objects_are_those_of_every_step(tmp_path, monkeypatch):
         return value(self, inputs)
 
     monkeypatch.setattr(SilhouetteLoss, "value", checked)
-    config = short_config(tmp_path / "data", tmp_path / "run", **{"pipeline.model.losses.silhouette.weight": 0.5})
+    config = short_config(short_run / "data", tmp_path / "run", **{"pipeline.model.losses.silhouette.weight": 0.5})
     run_to_end(config)
     assert len(seen) == STEPS[1]
     assert len({id(members) for members in seen}) == 1  # looked at once

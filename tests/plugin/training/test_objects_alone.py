@@ -130,7 +130,8 @@ def test_a_run_says_that_its_background_contradicts_itself(tmp_path, capsys, con
     write_trained(tmp_path / "base", tmp_path / "data", base=False)
     frame = {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False}
     options = {f"pipeline.datamanager.dataparser.{name}": value for name, value in frame.items()}
-    config = preset_config("beags-refine", {**options, "pipeline.model.refine_steps": 1}, tmp_path)
+    options |= {"pipeline.model.refine_steps": 1, "pipeline.model.close_contacts": False}
+    config = preset_config("beags-refine", options, tmp_path)
     config.data, config.run_dir, config.vis = tmp_path / "data", tmp_path / "run", "tensorboard"
     config.load_dir = tmp_path / "base/nerfstudio_models"
     run_to_end(config)

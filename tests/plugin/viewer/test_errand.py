@@ -85,6 +85,10 @@ def test_masks_are_saved_once_all_objects_are_picked_and_named_or_it_is_asked_fo
     assert not ended and not (tmp_path / "picks").exists()
     tab._save()
     assert "the program that opened it goes on" in told(tab, "Saved ")
+    end = time.monotonic() + 60.0
+    while not ended:  # The sentence is shown before.
+        assert time.monotonic() < end
+        time.sleep(0.02)
     assert ended == [window.viewer.viser_server]
     names = json.loads((tmp_path / "picks/classes.json").read_text())
     assert sorted(names.values()) == ["background", "bear 2", "low"]
