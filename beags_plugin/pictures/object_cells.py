@@ -24,7 +24,7 @@ from beags_plugin.surfaces.frames import bounding_box
 COLUMNS = 6  # cells in a line
 SMALLEST, LARGEST = 150, 480  # bounds for the side of a cell, pixels
 FAINT = 0.1  # alpha from which a stray Gaussian widens the crop
-STRAYS = 1.5  # most that strays of earlier stages widen the crop of the last one, times its side
+STRAYS = 1.3  # most that strays of earlier stages widen the crop of the last one, times its side
 _VIEWS = 2  # views in a line, each with photo, before and after
 _PROBE, _ROOM = 160, 3.0  # pixels, and sides of the object's box, of the search for stray Gaussians
 _BELOW, _LEVEL = -30.0, 10.0  # degrees above the horizon
