@@ -35,7 +35,7 @@ class LeftOut:
     def __str__(self) -> str:
         """Return a phrase for users: how many Gaussians were left out, and why."""
         outside = [f"{self.outside} that reach outside its masks"] if self.outside else []
-        loose = [f"{self.loose} in loose parts that hardly any mask supports"] if self.loose else []
+        loose = [f"{self.loose} in specks and loose parts that hardly any mask supports"] if self.loose else []
         if outside or loose:
             return f"{' and '.join(outside + loose)} left out"
         return f"nothing left out, as {self.doubt}" if self.doubt else "nothing left out"

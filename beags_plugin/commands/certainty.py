@@ -64,7 +64,7 @@ def certainty(
         magnified = prepared.get("magnified", 1.0)
         width, height = (round(magnified * side) for side in np.median([box for _, box in boxes], axis=0))
         figures["object pixels"] = [width, height]
-        finer = ": for more detail, add --downscale 1" if max(width, height) < SMALL else ""
+        finer = ": for more detail, add --downscale 1" if max(width, height) < SMALL and magnified == 1 else ""
         subject = "The object has" if len({class_id for class_id, _ in boxes}) == 1 else "Objects have"
         where = "close-ups" if magnified > 1 else "photos"
         lines.append(f"{subject} about {width} x {height} pixels in the {where} that training saw{finer}.")
@@ -101,10 +101,10 @@ def _next(again: str, agreement: dict[str, Any], masks: Path | None) -> list[str
 def _boxes(masks: Path) -> list[tuple[int, tuple[int, int]]]:
     """Return the class, and width and height of the bounding box in pixels, of every object in every photo's mask."""
     from beags_plugin.labels.classes import read_id_mask
-    from beags_plugin.views.close_ups import CLOSE_UP
+    from beags_plugin.views.close_ups import CLOSE_UPS
 
     boxes = []
-    for path in sorted(path for path in masks.rglob("*.png") if CLOSE_UP not in path.name):
+    for path in sorted(path for path in masks.rglob("*.png") if path.relative_to(masks).parts[0] != CLOSE_UPS):
         labels = read_id_mask(path)
         for class_id in np.setdiff1d(labels, [BACKGROUND, IGNORE]).tolist():
             rows, columns = np.nonzero(labels == class_id)

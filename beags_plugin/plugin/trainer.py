@@ -233,6 +233,11 @@ class BeagsTrainer(Trainer):
         """The folder of the run that this one resumes; None if nothing was loaded."""
         return self._checkpoints.loaded_run
 
+    @property
+    def loaded_close_ups(self) -> bool | None:
+        """Whether the loaded training saw close-ups of objects; None if nothing was loaded."""
+        return self._checkpoints.loaded_close_ups
+
     def keep(self, name: str, part: Resumable) -> None:
         """Let checkpoints hold the state of ``part``, and restore that of the loaded one if there is any."""
         self._checkpoints.keep(name, part)

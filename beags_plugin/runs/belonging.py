@@ -19,7 +19,7 @@ from beags_plugin.system.reading.tensors import load_tensors
 from beags_plugin.system.whole_files import write_whole
 
 BELONGING_FILE = "belonging.pt"  # It lies in a run's folder; once deleted, it is made anew.
-RULE = 1
+RULE = 2
 """Version of the rule in ``cleaning.clean``; decisions of another version are made anew."""
 
 

@@ -22,7 +22,7 @@ from beags_plugin.views.photo_files import Box, PhotoFiles
 from beags_plugin.views.split_photos import resize_area
 from beags_plugin.views.views import View
 
-CLOSE_UP = "-close-up-"  # A close-up's name is its photo's, this, and a number.
+CLOSE_UPS = "close-ups"  # A close-up's name is this folder, its photo's name, and a number.
 DETAIL = 4.0
 """Pixels stored of all close-ups of a photo, over the pixels of a step."""
 MOST_BYTES = 1e9
@@ -88,7 +88,7 @@ class CloseUps:
         self.close_ups += close_ups
         for each in close_ups:
             self._of_photo[each.photo].append(each)
-            self.names.append(f"{self._photos[each.photo]}{CLOSE_UP}{len(self._of_photo[each.photo])}")
+            self.names.append(f"{CLOSE_UPS}/{self._photos[each.photo]}-{len(self._of_photo[each.photo])}")
 
     def blind(self) -> list[int]:
         """Return the photos without a close-up."""

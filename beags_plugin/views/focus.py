@@ -17,7 +17,7 @@ from torch import Tensor
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE, count_ids
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
-from beags_plugin.views.close_ups import CloseUps, kept_pixels, kept_size, read_close_ups
+from beags_plugin.views.close_ups import MOST_BYTES, CloseUps, kept_pixels, kept_size, read_close_ups
 from beags_plugin.views.photo_files import Box, PhotoFiles
 
 SHARE = 0.5
@@ -72,14 +72,17 @@ def focused(
     choice is printed in a line.
     """
     share = share_of(focus)
-    if share == 0.0:
+    if share == 0.0 or (share is None and not _scaled_down(files)):
         return None
     cameras = files.cameras
     pixels = max(round(PIXELS * float((cameras.width * cameras.height).double().mean())), 1)
+    if share is None and (size := 3.0 * pixels * len(cameras)) > MOST_BYTES:
+        say(f"Close-ups of {len(cameras)} photos would take {size / 1e9:.1f} GB: focus is off.")
+        return None
     kept = kept_pixels(pixels, len(cameras))
     aims = {
         photo: _aim(files, photo, mask.cpu().numpy(), kept)
-        for photo in range(len(cameras))
+        for photo in track(range(len(cameras)), "Looking for objects", transient=True)
         if (mask := labels(photo)) is not None
     }
     with_objects = [aim for aim in aims.values() if aim.boxes]
@@ -105,6 +108,12 @@ def focused(
         photos = track(read, "Reading close-ups", total=len(aimed), transient=True)
         close_ups = [close_up for of_photo in photos for close_up in of_photo]
     return CloseUps(close_ups, names, pixels, share, seed, gain)
+
+
+def _scaled_down(files: PhotoFiles) -> bool:
+    """Return whether close-ups of any photo can show objects enough larger than the whole photo does."""
+    widths = files.cameras.width.flatten().tolist()
+    return any(files.full_camera(photo).width >= LEAST_GAIN * width for photo, width in enumerate(widths))
 
 
 def aim_by(close_ups: CloseUps, files: PhotoFiles, labels: Sequence[Tensor]) -> None:

@@ -100,7 +100,7 @@ def test_a_chip_that_others_hide_in_every_photo_is_left_out():
     part = joined(body, chip)
     keep, left_out = clean(part, 1, views(true, classes, joined(true, chip)))
     assert keep.tolist() == list(range(200)) and left_out == LeftOut(loose=6)
-    assert str(left_out) == "6 in loose parts that hardly any mask supports left out"
+    assert str(left_out) == "6 in specks and loose parts that hardly any mask supports left out"
 
 
 def test_a_part_that_masks_show_apart_stays():

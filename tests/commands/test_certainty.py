@@ -22,7 +22,7 @@ from beags_plugin.masks.check.contradictions import Contradiction
 from beags_plugin.objects import check_masks
 from beags_plugin.system.digests import folder_digest
 from beags_plugin.system.errors import UserError
-from beags_plugin.views.close_ups import CLOSE_UP
+from beags_plugin.views.close_ups import CLOSE_UPS
 
 
 def write_run(folder: Path, agreement: float | None, overruled: list[str]) -> Path:
@@ -55,7 +55,8 @@ def test_the_words_follow_from_what_the_masks_agree_on(tmp_path, agreement, over
 def test_the_size_is_that_in_close_ups_where_training_saw_some(tmp_path):
     run = write_run(tmp_path / "run", None, [])
     (run / "prepared/report.json").write_text(json.dumps({"magnified": 4.5}))
-    shutil.copy(run / "prepared/masks/a.png", run / f"prepared/masks/a{CLOSE_UP}1.png")
+    (run / "prepared/masks" / CLOSE_UPS).mkdir()
+    shutil.copy(run / "prepared/masks/a.png", run / "prepared/masks" / CLOSE_UPS / "a-1.png")
     found = certainty(run, tmp_path)
     assert found.figures["object pixels"] == [180, 90] and "--downscale" not in " ".join(found.lines)
 

@@ -94,8 +94,8 @@ def assert_same_run(one: Path, other: Path, but_for: str = "nothing"):
     curves = [without_clocks(json.loads((run / "held_out.json").read_text())) for run in (one, other)]
     assert curves[0] == curves[1] and len(curves[0]) >= 5
     folders = one / "prepared/masks", other / "prepared/masks"
-    files = sorted(path.name for path in folders[0].iterdir())
-    assert files and files == sorted(path.name for path in folders[1].iterdir())
+    files, others = (sorted(path.relative_to(folder) for path in folder.rglob("*.png")) for folder in folders)
+    assert files and files == others
     assert all((folders[0] / name).read_bytes() == (folders[1] / name).read_bytes() for name in files)
 
 

@@ -193,6 +193,13 @@ def test_other_labels_take_the_place_of_the_masks(tmp_path):
     assert torch.equal(data.close_up_views()[0].labels, new[0])
 
 
+def test_auto_keeps_close_ups_within_a_bound_of_memory(tmp_path, monkeypatch, capsys):
+    write_objects(tmp_path, (40, 30, 80, 60))
+    monkeypatch.setattr("beags_plugin.views.focus.MOST_BYTES", 10_000)
+    assert focused(tmp_path, "auto").close_ups is None
+    assert "GB: focus is off" in capsys.readouterr().out.replace("\n", " ")
+
+
 def test_auto_leaves_a_scene_alone_that_others_have_begun(tmp_path):
     write_objects(tmp_path, (40, 30, 80, 60))
     assert focused(tmp_path, "auto", begins=False).close_ups is None

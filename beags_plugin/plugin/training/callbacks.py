@@ -28,7 +28,7 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
     adam = cast(SceneOptimizer, attributes.optimizers).adam
     model.seed = trainer.config.machine.seed
     model.extent = camera_extent(datamanager.train_dataset.cameras.camera_to_worlds).to(model.device)
-    datamanager.focus()
+    datamanager.focus(trainer.loaded_close_ups)
     densifier = Densifier(model, adam, datamanager)
     switch = RefinementSwitch(model, trainer, datamanager)
     switch.check()

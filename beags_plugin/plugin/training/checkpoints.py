@@ -27,12 +27,14 @@ _MISFITS = (RuntimeError, LookupError, ValueError, TypeError, AttributeError)  #
 class Checkpoints:
     """Saves and restores the checkpoints of one run.
 
-    loaded_run: the folder of the run that this one resumes; None before ``restore``. saved_step: the last one saved.
+    loaded_run: the folder of the run that this one resumes; None before ``restore``. loaded_close_ups: whether the
+    loaded training saw close-ups; None before ``restore``. saved_step: the last one saved.
     """
 
     def __init__(self, config: BeagsTrainerConfig, base_dir: Path, folder: Path) -> None:
         self.config, self.base_dir, self.folder = config, base_dir, folder
         self.loaded_run: Path | None = None
+        self.loaded_close_ups: bool | None = None
         self._parts: dict[str, Resumable] = {}
         self._loaded_states: dict[str, Any] = {}
         self._loaded_from: Path | None = None
@@ -81,6 +83,7 @@ class Checkpoints:
             model.take_classes(classes)  # Refinement assigns the classes of a base anew.
             states.pop("refinement", None)
         say(f"Loaded {path}")
+        self.loaded_close_ups = bool(states.get("views", {}).get("close_ups", False))
         continues = self.config.continues(self.base_dir)
         self.loaded_run = self.base_dir.absolute() if continues else path.absolute().parent.parent
         if model.schedule.base_steps == 0 and int(model.refined_steps) == 0:

@@ -11,7 +11,7 @@ from torch.optim import Adam
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import Densified, GradientStatistics, densify, length_units, reset_opacity
 from beags_plugin.core.free_space import nearest_depths, reaches_before_camera
-from beags_plugin.plugin.training.near_growth import NearVotes, on_objects, shared_pixels
+from beags_plugin.plugin.training.near_growth import MaskedPhotos, on_objects, shared_pixels
 from beags_plugin.plugin.training.scene_edits import edit_scene, move_adam_state
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
@@ -32,7 +32,10 @@ class Densifier:
         stated, close_ups = model.config.densify.scaled(model.schedule.scale), datamanager.close_ups
         of_objects, elsewhere = (0, pixels) if close_ups is None else shared_pixels(pixels, close_ups.object_pixels())
         self.config, self.most_near = stated.bounded(elsewhere), stated.bounded(of_objects).max_surfels
-        self.near = None if close_ups is None else NearVotes(model.num_points, model.device)
+        self.photos: MaskedPhotos | None = None
+        if close_ups is not None:
+            with_objects = sorted({each.photo for each in close_ups.close_ups})
+            self.photos = MaskedPhotos.of(datamanager.views("train", original=True), with_objects)
         self.adam = adam
         self.statistics = GradientStatistics(model.num_points, model.device)
         self.free = self._free_depths()
@@ -40,10 +43,7 @@ class Densifier:
     def state(self) -> dict[str, Any]:
         """Return the statistics since the last growth, and whether space before cameras is freed; see ``Resumable``."""
         statistics = self.statistics if self.model.growing else GradientStatistics(0)
-        near = {}
-        if self.near is not None and self.model.growing:
-            near = {"near": [self.near.shown, self.near.inside]}
-        return {"total": statistics.total, "views": statistics.views, "frees": self.free is not None, **near}
+        return {"total": statistics.total, "views": statistics.views, "frees": self.free is not None}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from ``state``."""
@@ -52,9 +52,6 @@ class Densifier:
         if len(state["total"]) == self.model.num_points:
             own = self.statistics
             own.total, own.views = state["total"].clone().to(own.total), state["views"].clone().to(own.views)
-            if self.near is not None and "near" in state:
-                shown, inside = state["near"]
-                self.near.shown, self.near.inside = shown.clone().to(own.total), inside.clone().to(own.total)
 
     def before_step(self, step: int) -> None:
         """Turn on screen gradients for the step if the scene still grows."""
@@ -78,19 +75,15 @@ class Densifier:
         last = self.model.last_render
         if last is not None and last.screen_shift is not None and last.screen_shift.grad is not None:
             gradient, visible = last.screen_shift.grad.norm(dim=-1), last.render.visible
-            if self.near is not None and last.labels is not None:
-                inside = on_objects(self.model.surfels().means.detach(), last.camera, last.labels)
-                if last.close_up:
-                    visible = visible & inside
-                else:
-                    self.near.add(inside, visible)
+            if last.close_up and last.labels is not None:
+                visible = visible & on_objects(self.model.surfels().means.detach(), last.camera, last.labels)
             self.statistics.add(gradient, visible)
 
     def _densify(self, step: int) -> None:
         model = self.model
         surfels = model.surfels().detach()
         units = length_units(surfels.means, self.camera_centers, float(model.extent), self.config)
-        apart = None if self.near is None else (self.near.near(), self.most_near)
+        apart = None if self.photos is None else (self.photos.near(surfels.means), self.most_near)
         gradient = self.statistics.mean()
         self._edit(densify(surfels, gradient, units, self.config, step, model.generator(step), apart))
 
@@ -122,11 +115,9 @@ class Densifier:
         return cameras, self.config.free_share * nearest_depths(points, cameras)
 
     def _edit(self, edited: Densified, keep_statistics: bool = False) -> None:
-        model, gathered, near = self.model, self.statistics, self.near
+        model, gathered = self.model, self.statistics
         edit_scene(model, self.adam, edited)
         self.statistics = GradientStatistics(model.num_points, model.device)
-        if near is not None:
-            self.near = near.of(edited.source) if keep_statistics else NearVotes(model.num_points, model.device)
         if keep_statistics:
             self.statistics.total, self.statistics.views = (
                 values[edited.source] for values in (gathered.total, gathered.views)

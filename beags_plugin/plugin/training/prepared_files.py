@@ -36,10 +36,12 @@ def save_prepared(
         (folder / "confidence").mkdir(exist_ok=True)
     with progress_bar("Keeping masks", passing=True) as progress:
         for index, name in enumerate(counted(names, len(names), progress)):
-            labels = prepared.labels[index]
-            write_mask(folder / "masks" / f"{name}.png", labels.cpu().numpy().astype(np.uint16))
+            labels, path = prepared.labels[index], folder / "masks" / f"{name}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_mask(path, labels.cpu().numpy().astype(np.uint16))
             if prepared.confidence is not None:
                 path = folder / "confidence" / f"{name}.png"
+                path.parent.mkdir(exist_ok=True)
                 with writing(path):  # PIL is used because cv2 ignores a full disk.
                     Image.fromarray(prepared.confidence[index].cpu().numpy()).save(path)
     report = {

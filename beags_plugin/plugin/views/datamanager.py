@@ -85,12 +85,15 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
         config_path = path_option("--load-config") if program_name() == "ns-viewer" else None
         return super().get_datapath() if config_path is None else config_path.absolute().parent
 
-    def focus(self) -> None:
-        """Show close-ups of objects to training from here on, if the option ``focus`` says so."""
+    def focus(self, loaded: bool | None = None) -> None:
+        """Show close-ups of objects to training from here on, if the option ``focus`` says so.
+
+        loaded: whether the training that this one goes on with saw some; None if there is none.
+        """
         config, names = self.config, unique_names(self.train_dataset.image_filenames)
-        unknown_base = config.focus == "auto" and not config.begins
+        wanted = config.begins if loaded is None else loaded
         self.close_ups = focused(
-            "off" if unknown_base else config.focus,
+            "off" if config.focus == "auto" and not wanted else config.focus,
             self.files["train"],
             partial(self._labels, "train", original=True),
             names,
@@ -215,6 +218,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
             "train_generator": None if generator is None else generator.getstate(),
             "train_epochs": None if epochs is None else epochs.tolist(),
             "eval_generator": self._eval_order.getstate(),
+            "close_ups": self.close_ups is not None,
         }
 
     def restore(self, state: dict[str, Any]) -> None:

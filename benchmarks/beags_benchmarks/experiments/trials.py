@@ -117,7 +117,7 @@ def plan(
 
 def base_trial(experiment: Experiment, variant: Variant, scene: TrialScene, seed: int, code: str) -> Trial:
     """Return the training of a variant's base, which depends on photos but not on masks."""
-    changes = {**variant.base, MODEL + "refine_steps": 0}
+    changes = {"pipeline.datamanager.focus": "off", **variant.base, MODEL + "refine_steps": 0}
     return Trial(scene.photos or scene, experiment.preset, changes, seed, code)
 
 

@@ -1,4 +1,4 @@
-"""Focus in training: the same bits after a break and for any number of threads, sharper objects, and growth."""
+"""Focus in training: the same bits after a break and for any number of threads, and which runs see close-ups."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ pytest.importorskip("nerfstudio")
 from resumed_runs import assert_same_run, interrupted, kill_at, resume_to_end, run_to_end, short_config
 from run_folders import write_drawn_scene, write_scene
 
-from beags_plugin.views.close_ups import CLOSE_UP
+from beags_plugin.views.close_ups import CLOSE_UPS
 
 FOCUSED = {
     "pipeline.datamanager.focus": "0.5",
@@ -50,20 +50,37 @@ def test_the_number_of_threads_is_no_matter(focused, tmp_path):
 
 
 def test_close_ups_get_consistent_masks_of_their_own(focused):
-    masks = {path.stem for path in (focused / "run/prepared/masks").iterdir()}
-    near = {name for name in masks if CLOSE_UP in name}
-    assert near and {name.partition(CLOSE_UP)[0] for name in near} <= masks - near
+    folder = focused / "run/prepared/masks"
+    masks, near = ({path.stem for path in each.glob("*.png")} for each in (folder, folder / CLOSE_UPS))
+    assert near and {name.rpartition("-")[0] for name in near} <= masks
     report = json.loads((focused / "run/prepared/report.json").read_text())
-    assert {each["view"] for each in report["agreement"]["views"]} == masks - near and report["magnified"] > 1.2
+    assert {each["view"] for each in report["agreement"]["views"]} == masks and report["magnified"] > 1.2
 
 
-def test_close_ups_belong_to_runs_with_a_base_of_their_own(tmp_path, capsys):
-    data, base = tmp_path / "data", tmp_path / "base"
+def test_a_run_that_goes_on_with_another_sees_close_ups_if_that_did(tmp_path, capsys):
+    data = tmp_path / "data"
     write_drawn_scene(data)
-    auto = {**FOCUSED, "pipeline.datamanager.focus": "auto"}
-    run_to_end(short_config(data, base, **auto, **{"pipeline.model.refine_steps": 0}))
-    assert "of the steps see close-ups" in capsys.readouterr().out.replace("\n", " ")
-    options = {**auto, "load_dir": base / "nerfstudio_models", "pipeline.model.base_steps": 0}
-    run_to_end(short_config(data, tmp_path / "refined", **options))
-    assert "of the steps see close-ups" not in capsys.readouterr().out.replace("\n", " ")
-    assert not [path for path in (tmp_path / "refined/prepared/masks").iterdir() if CLOSE_UP in path.name]
+
+    def saw(name: str, focus: str, **options) -> bool:
+        own = {**FOCUSED, "pipeline.datamanager.focus": focus, **options}
+        run_to_end(short_config(data, tmp_path / name, **own))
+        folder = tmp_path / name / "prepared/masks" / CLOSE_UPS
+        said = "of the steps see close-ups" in capsys.readouterr().out.replace("\n", " ")
+        assert folder.exists() == (said and "load_dir" in own)
+        return said
+
+    assert saw("near", "auto", **{"pipeline.model.refine_steps": 0})
+    assert not saw("far", "off", **{"pipeline.model.refine_steps": 0})
+    alone = {"pipeline.model.base_steps": 0}
+    assert saw("near-refined", "auto", load_dir=tmp_path / "near/nerfstudio_models", **alone)
+    assert not saw("far-refined", "auto", load_dir=tmp_path / "far/nerfstudio_models", **alone)
+
+
+def test_objects_alone_and_masks_of_some_photos_are_trained_with_close_ups(tmp_path):
+    data = tmp_path / "data"
+    write_drawn_scene(data)
+    for path in sorted((data / "masks").glob("*.png"))[::2]:
+        path.unlink()
+    options = {**FOCUSED, "pipeline.datamanager.photos": "objects"}
+    run_to_end(short_config(data, tmp_path / "run", **options))
+    assert any((tmp_path / "run/prepared/masks" / CLOSE_UPS).glob("*.png"))

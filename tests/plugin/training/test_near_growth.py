@@ -14,7 +14,8 @@ from random_surfels import random_surfels
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import DensifyConfig, densify
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.plugin.training.near_growth import MORE, NearVotes, on_objects, shared_pixels
+from beags_plugin.plugin.training.near_growth import MORE, PHOTOS, MaskedPhotos, on_objects, shared_pixels
+from beags_plugin.views.views import View
 
 
 def test_centres_are_looked_up_in_the_pixel_that_shows_them():
@@ -27,12 +28,26 @@ def test_centres_are_looked_up_in_the_pixel_that_shows_them():
     assert on_objects(means, camera, labels).tolist() == [True, False, False, False, False, True, False, False]
 
 
-def test_nearly_all_photos_decide_and_votes_follow_their_gaussians():
-    votes = NearVotes(3)
-    for inside in (*[[True, True, False]] * 7, [True, False, False], [True, False, True]):
-        votes.add(torch.tensor(inside), torch.tensor([True, True, False]))
-    assert votes.near().tolist() == [True, False, False]
-    assert votes.of(torch.tensor([2, 0, 0])).near().tolist() == [False, True, True]
+def test_nearly_all_photos_with_labels_there_decide():
+    """A photo votes on the places that it shows, if it says what is there."""
+    camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 4], [0, 10.0, 3], [0, 0, 1]]), 8, 6)
+    means = torch.tensor([[0.1, 0.1, 2.0], [0.5, 0.1, 2.0], [9.0, 0.0, 2.0]])  # pixels (4, 3), (6, 3), none
+    photos = []
+    for number in range(10):
+        labels = torch.zeros(6, 8, dtype=torch.int32)
+        labels[3, 4], labels[3, 6] = 2, 2 if number < 8 else 0
+        photos.append((camera, labels))
+    unlabelled = (camera, torch.full((6, 8), IGNORE, dtype=torch.int32))
+    assert MaskedPhotos(photos + 30 * [unlabelled]).near(means).tolist() == [True, False, False]
+
+
+def test_photos_from_all_over_the_path_are_asked():
+    views = [
+        View(Camera(torch.eye(4), torch.eye(3), 1, 1), str(number), dict, lambda: torch.ones(1, 1))
+        for number in range(200)
+    ]
+    assert len(MaskedPhotos.of(views, list(range(0, 200, 2))).photos) == PHOTOS
+    assert len(MaskedPhotos.of(views, [3, 9]).photos) == 2
 
 
 def test_each_part_grows_within_its_bound():
