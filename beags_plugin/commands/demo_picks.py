@@ -32,7 +32,7 @@ from beags_plugin.system.whole_files import write_text_atomically
 APART = "apart"  # Folder in the output: masks/, classes.json, report.json and doubt.png of separated things.
 APART_STAMP = "apart.json"  # This file in APART holds digests of the inputs of the masks, and of the masks as made.
 FOLDER = "pick"  # Folder in the output: run/ is the base; masks/ and classes.json hold the picked objects.
-OF_MASKS = ("masks", "classes.json", MADE, *OWN_PICTURES)  # Files that a base does not depend on.
+OF_MASKS = ("masks", "classes.json", MADE, *OWN_PICTURES)  # They choose a base's close-ups alone.
 
 
 def names_of(data: Path, objects: int) -> tuple[str, ...]:
