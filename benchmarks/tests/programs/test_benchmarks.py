@@ -54,7 +54,7 @@ def test_a_program_finds_what_it_imports_from_us(path):
 
 
 @pytest.mark.parametrize("name", ["kernels.rasterizer", "kernels.cuda", "studies.answers", "studies.page_tables"])
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # Python warns of a module that this process has imported already.
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # Python warns of modules that are imported already.
 def test_a_program_says_what_it_takes(name, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [name, "--help"])
     with pytest.raises(SystemExit) as end:
