@@ -20,6 +20,7 @@ _OF_GAUSSIAN: dict[str, tuple[int | None, ...]] = {
 }  # fmt: skip
 """Shapes of the values of one Gaussian; None: any size."""
 _NOT_FLOATS = ("class_ids", "assigned")
+SAW_CLOSE_UPS = "saw_close_ups"  # Set in a checkpoint of a scene alone if its training saw close-ups.
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.options.run_format import CONFIG_FILE
+from beags_plugin.runs.checkpoint_file import SAW_CLOSE_UPS
 from beags_plugin.runs.relocation import AnyConfig
 from beags_plugin.splat_io.frames import TRANSFORM_FILE
 from beags_plugin.system.whole_files import write_text_atomically, write_whole
@@ -21,10 +22,12 @@ def save_atomically(content: Any, path: Path) -> None:
     write_whole(path, lambda file: torch.save(content, file), path.parent.parent)
 
 
-def write_run(config: AnyConfig, folder: Path, model_state: dict[str, Tensor], step: int) -> Path:
+def write_run(
+    config: AnyConfig, folder: Path, model_state: dict[str, Tensor], step: int, close_ups: bool = False
+) -> Path:
     """Write a run that holds ``model_state`` of a ``BeagsModel``; returns the path of its config.yml.
 
-    config: of the run from which it is made. step: of the checkpoint.
+    config: of the run from which it is made. step: of the checkpoint. close_ups: whether its training saw close-ups.
     """
     folder = folder.absolute()
     state = {
@@ -32,6 +35,8 @@ def write_run(config: AnyConfig, folder: Path, model_state: dict[str, Tensor], s
         for name, value in model_state.items()
     }
     checkpoint = {"step": step, "pipeline": state, "optimizers": {}, "schedulers": {}, "scalers": {}}
+    if close_ups:
+        checkpoint[SAW_CLOSE_UPS] = True
     path = folder / config.relative_model_dir / f"step-{step:09d}.ckpt"
     save_atomically(checkpoint, path)
     for old in path.parent.glob("*.ckpt"):  # An earlier run may have been written here.

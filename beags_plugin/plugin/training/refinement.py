@@ -207,7 +207,9 @@ class RefinementSwitch:
                 say(f"  {line}")
             self._take_classes(prepared.assignment)
             snapshot = self.trainer.base_dir / BASE_SNAPSHOT  # The last file of save_prepared marks it as complete.
-            write_run(self.trainer.config, snapshot, model.state_dict(), max(step, 0))
+            write_run(
+                self.trainer.config, snapshot, model.state_dict(), max(step, 0), close_ups=len(views) > len(whole)
+            )
             say(f"  base kept in {snapshot}")
             if fit is not None and fit.contradict:
                 say(fit.sentence(), warning=True)

@@ -74,6 +74,8 @@ def test_a_run_that_goes_on_with_another_sees_close_ups_if_that_did(tmp_path, ca
     alone = {"pipeline.model.base_steps": 0}
     assert saw("near-refined", "auto", load_dir=tmp_path / "near/nerfstudio_models", **alone)
     assert not saw("far-refined", "auto", load_dir=tmp_path / "far/nerfstudio_models", **alone)
+    assert saw("near-again", "auto", load_dir=tmp_path / "near-refined/base/nerfstudio_models", **alone)
+    assert not saw("far-again", "auto", load_dir=tmp_path / "far-refined/base/nerfstudio_models", **alone)
 
 
 def test_objects_alone_and_masks_of_some_photos_are_trained_with_close_ups(tmp_path):
