@@ -63,10 +63,15 @@ class VisibilityGrid:
                     raise _too_far(voxel_size)
                 return cls(voxel_size, origin, num_classes, *tally.pure())
         keys = torch.zeros(0, dtype=torch.int64, device=origin.device)
-        classes = keys.int()
+        classes, waiting = keys.int(), []
         for points, class_ids in clouds:
             own = _pack(_voxels(points, origin, voxel_size))
-            keys, classes = _distinct(torch.cat([keys, own]), torch.cat([classes, class_ids.int()]), num_classes)
+            waiting.append(_distinct(own, class_ids.int(), num_classes))
+            # Merged in few rounds, as each sorts all voxels.
+            if sum(len(pair[0]) for pair in waiting) > len(keys):
+                keys, classes = _merged([(keys, classes), *waiting], num_classes)
+                waiting.clear()
+        keys, classes = _merged([(keys, classes), *waiting], num_classes)
         _, voxel, seen = torch.unique(keys, return_inverse=True, return_counts=True)
         alone = seen[voxel] == 1
         return cls(voxel_size, origin, num_classes, keys[alone], classes[alone])
@@ -213,6 +218,11 @@ def _distinct(keys: Tensor, classes: Tensor, num_classes: int) -> tuple[Tensor, 
     voxels, rank = torch.unique(keys, return_inverse=True)
     pairs = torch.unique(rank * num_classes + classes)
     return voxels[pairs // num_classes], (pairs % num_classes).int()
+
+
+def _merged(pairs: list[tuple[Tensor, Tensor]], num_classes: int) -> tuple[Tensor, Tensor]:
+    keys, classes = zip(*pairs, strict=True)
+    return _distinct(torch.cat(keys), torch.cat(classes), num_classes)
 
 
 def _count(keys: Tensor, voxels: Tensor) -> Tensor:
