@@ -22,7 +22,7 @@ from beags_plugin.system.progress import each_view
 
 AUTO = "auto"  # It stands for pairwise up to the two limits, else for voxel.
 PAIRWISE_PIXELS = 100_000_000  # Pixels of all views; pairwise holds 5 bytes for each, 0.5 GB.
-PAIRWISE_PAIRS = 10_000_000_000  # Pairs of a voting pixel and a view; each takes 7 to 9 ns on one core at 256 x 192.
+PAIRWISE_PAIRS = 1_000_000_000  # Pairs of a voting pixel and a view; each takes 7 to 9 ns on one core at 256 x 192.
 
 Stage = Callable[[str], AbstractContextManager[Progress | None]]
 """Opens a named stage and returns its progress callback, such as a progress bar."""

@@ -24,7 +24,7 @@ SHARE = 0.5
 """Default share of the steps that see a close-up."""
 MOST_COVERED = 0.4
 """Share of the photos' pixels from which on objects are large enough without close-ups."""
-PIXELS = 0.8
+PIXELS = 0.6
 """Pixels of a step with a close-up, over those of a whole photo: a close-up has more Gaussians per pixel, which cost
 time."""
 LEAST_GAIN = 1.2
