@@ -129,8 +129,9 @@ def _trained_on_base(
 ) -> MadeScene:  # fmt: skip
     """Train the base of a scene, and refine it with masks made on it; return the scene with these masks.
 
-    how: entries of the request by which the run differs from one without such masks. with_masks: takes the folder of
-    the base's run, and returns the scene with masks.
+    If these masks let a training see close-ups of the objects, all is trained anew with them instead. how: entries of
+    the request by which the run differs from one without such masks. with_masks: takes the folder of the base's run,
+    and returns the scene with masks.
     """
     from beags_plugin.runs.prepared import photos_contradict
 
@@ -141,13 +142,32 @@ def _trained_on_base(
     scene = with_masks(base)
     request = {**request, "inputs": inputs_digest(scene, output, request["preset"]), **how}
     words = ("--load-dir", str((base / "nerfstudio_models").absolute()), "--pipeline.model.base-steps", "0")
+    if anew := _sees_close_ups(scene, request["downscale"]):
+        CONSOLE.print("Training begins anew, now with close-ups of the objects, which come out sharper by them.")
+        words = ("--pipeline.model.prepare.agree", "False")
     train_once(scene, output, request, fresh, words=words)
+    if anew:
+        report = json.loads((output / "run" / "training.json").read_text())
+        seconds["base training"] += report["seconds"].get("base training", 0.0)
     if photos_contradict(output / "run"):
         CONSOLE.print(
             "The photos contradict each other outside the masks, as on a turntable: without --pick and --objects, "
             "poses and training use the objects' pixels alone."
         )
     return scene
+
+
+def _sees_close_ups(scene: MadeScene, downscale: float) -> bool:
+    """Return whether a training from the beginning with the scene's masks sees close-ups of its objects."""
+    from beags_plugin.views.data_options import DataOptions, RunViewOptions
+    from beags_plugin.views.focus import sees_close_ups
+    from beags_plugin.views.run_data import RunData
+
+    options = DataOptions(scene.data, downscale_factor=downscale)
+    if scene.labels is not None:
+        options.masks_path, classes = scene.mask_paths()
+        options.classes_path = classes if classes.exists() else options.classes_path
+    return sees_close_ups(RunData(RunViewOptions(dataparser=options), "val").files["train"])
 
 
 def _check_objects(data: Path | None, pick: bool, objects: int, strict: bool) -> None:

@@ -50,8 +50,13 @@ class MadeScene:
         """Return the options of ``beags-data`` that name its masks."""
         if self.labels is None:
             return []
-        masks, classes = self.labels.absolute() / "masks", self.labels.absolute() / "classes.json"
+        masks, classes = self.mask_paths()
         return ["--masks-path", str(masks), *(["--classes-path", str(classes)] if classes.exists() else [])]
+
+    def mask_paths(self) -> tuple[Path, Path]:
+        """Return the folder of its masks, and the file of their classes, which may be missing."""
+        folder = (self.labels or self.data).absolute()
+        return folder / "masks", folder / "classes.json"
 
     def digests(self, output: Path) -> list[str]:
         """Return digests of the scene's files, without those that the demo wrote into ``output`` inside the scene."""

@@ -11,6 +11,7 @@ from itertools import combinations
 
 import cv2
 import numpy as np
+import torch
 from rich.progress import track
 from torch import Tensor
 
@@ -63,6 +64,27 @@ def share_of(focus: str) -> float | None:
     raise UserError(f"datamanager.focus is {focus}: give auto, off, or the share of the steps with objects, 0 to 1.")
 
 
+@dataclass(frozen=True)
+class _Plan:
+    """Which close-ups training sees.
+
+    share: of the steps. pixels: of a step. aims: by photo, of those with labels. covered, gain, side: means of these.
+    """
+
+    share: float
+    pixels: int
+    aims: dict[int, Aim]
+    covered: float
+    gain: float
+    side: float
+
+    def __str__(self) -> str:
+        return (
+            f"Objects cover {self.covered:.1%} of the photos' pixels: {self.share:.0%} of the steps see close-ups of "
+            f"them, in which they are about {self.side * self.gain:.0f} pixels large, not {self.side:.0f}."
+        )
+
+
 def focused(
     focus: str, files: PhotoFiles, labels: Callable[[int], Tensor | None], names: Sequence[str], seed: int
 ) -> CloseUps | None:
@@ -71,14 +93,39 @@ def focused(
     labels: returns the labels of a photo [H, W] int32 at the size of the training, or None. names: of the photos. The
     choice is printed in a line.
     """
+    plan = _planned(focus, files, labels)
+    if plan is not None:
+        say(str(plan))
+    if not isinstance(plan, _Plan):
+        return None
+    kept = kept_pixels(plan.pixels, len(files.cameras))
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        aimed = [photo for photo, aim in plan.aims.items() if aim.boxes]
+        read = pool.map(lambda photo: read_close_ups(files, photo, plan.aims[photo].boxes, kept), aimed)
+        photos = track(read, "Reading close-ups", total=len(aimed), transient=True)
+        close_ups = [close_up for of_photo in photos for close_up in of_photo]
+    return CloseUps(close_ups, names, plan.pixels, plan.share, seed, plan.gain)
+
+
+def sees_close_ups(files: PhotoFiles) -> bool:
+    """Return whether a training on these photos and their masks sees close-ups by itself (``focus`` auto)."""
+
+    def labels(photo: int) -> Tensor | None:
+        mask = files.mask_labels(photo)
+        return None if mask is None else torch.from_numpy(mask.astype(np.int32))
+
+    return isinstance(_planned("auto", files, labels), _Plan)
+
+
+def _planned(focus: str, files: PhotoFiles, labels: Callable[[int], Tensor | None]) -> _Plan | str | None:
+    """Return which close-ups training sees; otherwise a sentence on why it sees none, or None."""
     share = share_of(focus)
     if share == 0.0 or (share is None and not _scaled_down(files)):
         return None
     cameras = files.cameras
     pixels = max(round(PIXELS * float((cameras.width * cameras.height).double().mean())), 1)
     if share is None and (size := 3.0 * pixels * len(cameras)) > MOST_BYTES:
-        say(f"Close-ups of {len(cameras)} photos would take {size / 1e9:.1f} GB: focus is off.")
-        return None
+        return f"Close-ups of {len(cameras)} photos would take {size / 1e9:.1f} GB: focus is off."
     kept = kept_pixels(pixels, len(cameras))
     aims = {
         photo: _aim(files, photo, mask.cpu().numpy(), kept)
@@ -86,28 +133,16 @@ def focused(
         if (mask := labels(photo)) is not None
     }
     with_objects = [aim for aim in aims.values() if aim.boxes]
-    covered = float(np.mean([aim.covered for aim in aims.values()])) if aims else 0.0
     if not with_objects:
-        if share is not None:
-            say("No mask of a training photo shows an object: focus is off.")
-        return None
+        return None if share is None else "No mask of a training photo shows an object: focus is off."
+    covered = float(np.mean([aim.covered for aim in aims.values()]))
     gain = float(np.mean([aim.gain for aim in with_objects]))
-    if share is None and (covered >= MOST_COVERED or gain < LEAST_GAIN):
-        if covered >= MOST_COVERED and gain >= LEAST_GAIN:
-            say(f"Objects cover {covered:.0%} of the photos' pixels: training sees whole photos alone (focus is off).")
+    if share is None and gain < LEAST_GAIN:
         return None
-    share = SHARE if share is None else share
+    if share is None and covered >= MOST_COVERED:
+        return f"Objects cover {covered:.0%} of the photos' pixels: training sees whole photos alone (focus is off)."
     side = float(np.mean([aim.side for aim in with_objects]))
-    say(
-        f"Objects cover {covered:.1%} of the photos' pixels: {share:.0%} of the steps see close-ups of them, in which "
-        f"they are about {side * gain:.0f} pixels large, not {side:.0f}."
-    )
-    with ThreadPoolExecutor(max_workers=2) as pool:
-        aimed = [photo for photo, aim in aims.items() if aim.boxes]
-        read = pool.map(lambda photo: read_close_ups(files, photo, aims[photo].boxes, kept), aimed)
-        photos = track(read, "Reading close-ups", total=len(aimed), transient=True)
-        close_ups = [close_up for of_photo in photos for close_up in of_photo]
-    return CloseUps(close_ups, names, pixels, share, seed, gain)
+    return _Plan(SHARE if share is None else share, pixels, aims, covered, gain, side)
 
 
 def _scaled_down(files: PhotoFiles) -> bool:

@@ -18,6 +18,8 @@ from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.objects import picked_masks
 from beags_plugin.system.errors import UserError
 
+SIZE = 12, 20  # height and width of the photos
+
 
 class Stand:
     """A demo whose trainings and viewer only leave what says that they ended; said: the programs that were started."""
@@ -27,7 +29,7 @@ class Stand:
         (self.data / "classes.json").unlink()
         self.output = root / "out"
         self.said: list[list[str]] = []
-        self.saves, self.code, self.error = True, 0, None
+        self.saves, self.code, self.error, self.downscale = True, 0, None, None
         monkeypatch.setattr(demo_training, "finish", self.train)
         monkeypatch.setattr(demo_picks, "subprocess", SimpleNamespace(run=self.view))
         monkeypatch.setattr(demo, "measure", lambda *_: self.said.append(["measured"]))
@@ -46,7 +48,7 @@ class Stand:
             raise self.error
         if self.saves:
             folder = Path(words[words.index("--save-to") + 1])
-            write_image(folder / "masks/v01.png", np.full((60, 100), len(self.said) % 2, np.uint8))
+            write_image(folder / "masks/v01.png", np.full(SIZE, len(self.said) % 2, np.uint8))
             (folder / "classes.json").write_text('{"1": "bear"}')
             (folder / picked_masks.STAMP).write_text(picked_masks._digest(folder))
         return SimpleNamespace(returncode=self.code)
@@ -54,7 +56,7 @@ class Stand:
     def run(self, fresh: bool = False, pick: bool = True, objects: int = 1) -> list[str]:
         """Run the demo; return what was started, in a word each."""
         self.said.clear()
-        demo.run_demo(self.data, self.output, "beags-tiny", None, 0, fresh, pick=pick, objects=objects)
+        demo.run_demo(self.data, self.output, "beags-tiny", self.downscale, 0, fresh, pick=pick, objects=objects)
         return [self.kind(words) for words in self.said]
 
     @staticmethod
@@ -86,6 +88,33 @@ def test_base_viewer_and_refinement_follow_one_another_and_each_is_done_once(sta
     assert stand.run() == ["measured"]
 
 
+def test_close_ups_of_a_small_object_need_a_training_with_its_masks_from_the_beginning(stand, monkeypatch, capsys):
+    seconds: list[dict[str, float]] = []
+    monkeypatch.setattr(demo, "measure", lambda run, output, seconds_of, *_: seconds.append(dict(seconds_of)))
+    small, large = np.zeros((2, *SIZE), np.uint8)
+    small[4:8, 4:10], large[:8] = 1, 1
+    save, chosen = stand.view, [small]
+
+    def view(words, **options):
+        done = save(words, **options)
+        folder = stand.output / "pick"
+        write_image(folder / "masks/v01.png", chosen[0])
+        (folder / picked_masks.STAMP).write_text(picked_masks._digest(folder))
+        return done
+
+    monkeypatch.setattr(demo_picks, "subprocess", SimpleNamespace(run=view))
+    stand.downscale = 2.0
+    assert stand.run() == ["base", "view", "both"]
+    assert "Training begins anew, now with close-ups" in capsys.readouterr().out
+    words = stand.said[2]
+    assert words[words.index("--masks-path") + 1] == str(stand.output / "pick/masks")
+    assert words[words.index("--pipeline.model.prepare.agree") + 1] == "False"
+    assert seconds.pop()["base training"] == 6.0  # of both bases
+    chosen[0] = large
+    assert stand.run(fresh=True) == ["view", "refined"]
+    assert "close-ups" not in capsys.readouterr().out and seconds.pop()["base training"] == 3.0
+
+
 def test_things_that_lie_apart_are_told_apart_on_the_base_and_masks_of_them_that_were_mended_stay(
     stand, monkeypatch, capsys
 ):
@@ -94,8 +123,8 @@ def test_things_that_lie_apart_are_told_apart_on_the_base_and_masks_of_them_that
 
     def split(config, options, output, things, enlarge):
         stand.said.append(["apart", str(config), str(options.masks), str(things), str(enlarge)])
-        write_image(output / "masks/v01.png", np.full((60, 100), len(stand.said) % 2, np.uint8))
-        (output / "classes.json").write_text('{"1": "bear 1"}')
+        write_image(output / "masks/v01.png", np.full(SIZE, len(stand.said) % 2, np.uint8))
+        (output / "classes.json").write_text('{"1": "bear 1", "7": "bear 7", "8": "bear 8"}')
         return ["Only one thing lies apart"]
 
     monkeypatch.setattr("beags_plugin.objects.agree_masks.agree_masks", split)
@@ -109,19 +138,19 @@ def test_things_that_lie_apart_are_told_apart_on_the_base_and_masks_of_them_that
     with pytest.raises(UserError, match=r"that was trained with --objects 3: add --fresh to replace it \(its base is"):
         stand.run(pick=False, objects=2)
     assert stand.run(True, pick=False, objects=2) == ["apart", "refined", "measured"]
-    write_image(stand.output / "apart/masks/v01.png", np.full((60, 100), 7, np.uint8))
+    write_image(stand.output / "apart/masks/v01.png", np.full(SIZE, 7, np.uint8))
     assert stand.run(True, pick=False, objects=3) == ["refined", "measured"]
     assert "were mended, so they stay" in capsys.readouterr().out
     mended = {stand.output / f"{name}/masks/v01.png": name for name in ("made", "apart")}
     for path, name in mended.items():
-        write_image(path, np.full((60, 100), 8, np.uint8))
+        write_image(path, np.full(SIZE, 8, np.uint8))
         (path.parents[1] / f"{name}.json").write_text("{")  # a damaged stamp
     assert stand.run(True, pick=False, objects=3) == ["refined", "measured"]
     assert all(np.unique(read_id_mask(path)).tolist() == [8] for path in mended)
 
 
 def test_masks_that_nobody_made_here_hold_no_things_to_tell_apart(stand):
-    write_image(stand.data / "masks/v01.png", np.full((60, 100), 1, np.uint8))
+    write_image(stand.data / "masks/v01.png", np.full(SIZE, 1, np.uint8))
     with pytest.raises(UserError, match=r"are not a network's .* leave --objects out, or add --pick\."):
         stand.run(pick=False, objects=2)
     assert stand.said == []
@@ -160,8 +189,8 @@ def test_a_viewer_that_is_interrupted_or_fails_tells_how_to_go_on(stand, capsys)
 
 def test_masks_that_were_mended_after_picking_stay(stand, capsys):
     stand.run()
-    write_image(stand.output / "pick/masks/v01.png", np.full((60, 100), 1, np.uint8))
-    write_image(stand.output / "pick/masks/v02.png", np.full((60, 100), 1, np.uint8))
+    write_image(stand.output / "pick/masks/v01.png", np.full(SIZE, 1, np.uint8))
+    write_image(stand.output / "pick/masks/v02.png", np.full(SIZE, 1, np.uint8))
     assert stand.run(fresh=True) == ["refined", "measured"]
     assert "were mended, so they stay" in capsys.readouterr().out
 
