@@ -14,6 +14,7 @@ from beags_plugin.commands.demo_picks import (
     APART,
     check_one_object,
     check_trained_otherwise,
+    close_ups_help,
     names_of,
     picked_scene,
     things_apart,
@@ -129,26 +130,25 @@ def _trained_on_base(
 ) -> MadeScene:  # fmt: skip
     """Train the base of a scene, and refine it with masks made on it; return the scene with these masks.
 
-    If these masks let a training see close-ups of the objects, all is trained anew with them instead. how: entries of
-    the request by which the run differs from one without such masks. with_masks: takes the folder of the base's run,
-    and returns the scene with masks.
+    If the base saw no close-ups of the objects, and these masks show that they help, the whole scene is trained again
+    instead. how: entries of the request by which the run differs from one without such masks. with_masks: takes the
+    folder of the base's run, and returns the scene with masks.
     """
     from beags_plugin.runs.prepared import photos_contradict
 
     made = output / "made"  # A demo without picks trains with the masks that it has made here.
     inputs = inputs_digest(replace(scene, labels=made if made.exists() else None), output, request["preset"])
     base = trained_base(replace(scene, labels=None), output, request, {**request, "inputs": inputs}, fresh)
-    seconds["base training"] = json.loads((base / "training.json").read_text())["seconds"].get("base training", 0.0)
+    seconds["base training"] = _base_seconds(base)
     scene = with_masks(base)
     request = {**request, "inputs": inputs_digest(scene, output, request["preset"]), **how}
     words = ("--load-dir", str((base / "nerfstudio_models").absolute()), "--pipeline.model.base-steps", "0")
-    if anew := _sees_close_ups(scene, request["downscale"]):
-        CONSOLE.print("Training begins anew, now with close-ups of the objects, which come out sharper by them.")
-        words = ("--pipeline.model.prepare.agree", "False")
+    begins = fresh or request not in (former := read_stamp(output), former.get(STARTED))
+    if begins and close_ups_help(scene, base, request, same="objects" in how):
+        CONSOLE.print("Training starts again, now with close-ups of the objects, so that they come out sharper.")
+        words = ()
     train_once(scene, output, request, fresh, words=words)
-    if anew:
-        report = json.loads((output / "run" / "training.json").read_text())
-        seconds["base training"] += report["seconds"].get("base training", 0.0)
+    seconds["base training"] += _base_seconds(output / "run")
     if photos_contradict(output / "run"):
         CONSOLE.print(
             "The photos contradict each other outside the masks, as on a turntable: without --pick and --objects, "
@@ -157,17 +157,8 @@ def _trained_on_base(
     return scene
 
 
-def _sees_close_ups(scene: MadeScene, downscale: float) -> bool:
-    """Return whether a training from the beginning with the scene's masks sees close-ups of its objects."""
-    from beags_plugin.views.data_options import DataOptions, RunViewOptions
-    from beags_plugin.views.focus import sees_close_ups
-    from beags_plugin.views.run_data import RunData
-
-    options = DataOptions(scene.data, downscale_factor=downscale)
-    if scene.labels is not None:
-        options.masks_path, classes = scene.mask_paths()
-        options.classes_path = classes if classes.exists() else options.classes_path
-    return sees_close_ups(RunData(RunViewOptions(dataparser=options), "val").files["train"])
+def _base_seconds(run: Path) -> float:
+    return json.loads((run / "training.json").read_text())["seconds"].get("base training", 0.0)
 
 
 def _check_objects(data: Path | None, pick: bool, objects: int, strict: bool) -> None:

@@ -1,15 +1,17 @@
-"""``beags demo --pick``: the base trains, objects are picked on it in the viewer, and their masks refine it."""
+"""``beags demo --pick``: the base trains, objects are picked on it in the viewer, and training goes on with masks."""
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from beags_plugin.commands.answers import CONSOLE, read_object
 from beags_plugin.commands.demo_training import (
@@ -28,6 +30,9 @@ from beags_plugin.system.child_processes import bound
 from beags_plugin.system.digests import folder_digest, value_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.whole_files import write_text_atomically
+
+if TYPE_CHECKING:
+    from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
 
 APART = "apart"  # Folder in the output: masks/, classes.json, report.json and doubt.png of separated things.
 APART_STAMP = "apart.json"  # This file in APART holds digests of the inputs of the masks, and of the masks as made.
@@ -127,6 +132,28 @@ def things_apart(scene: MadeScene, output: Path, base: Path, objects: int) -> Ma
             CONSOLE.print(line)
         write_text_atomically(json.dumps({"of": made_of, "masks": folder_digest(masks)}), stamp)
     return replace(scene, labels=folder)
+
+
+def close_ups_help(scene: MadeScene, base: Path, request: dict[str, Any], same: bool) -> bool:
+    """Return whether a training from the beginning with the scene's masks sees close-ups that the base did not see.
+
+    base: its run. request: preset and size. same: whether masks that the base may have had show the same objects.
+    """
+    from beags_plugin.plugin.presets import load_preset
+    from beags_plugin.runs.checkpoint_file import read_checkpoint, saw_close_ups
+    from beags_plugin.runs.layout import newest_checkpoint
+    from beags_plugin.views.data_options import DataOptions, RunViewOptions
+    from beags_plugin.views.focus import sees_close_ups
+    from beags_plugin.views.run_data import RunData
+
+    masks, classes = scene.mask_paths()
+    options = DataOptions(scene.data, masks_path=masks, downscale_factor=request["downscale"])
+    options.classes_path = classes if classes.exists() else options.classes_path
+    focus = cast("BeagsDataManagerConfig", load_preset(request["preset"]).config.pipeline.datamanager).focus
+    with redirect_stdout(io.StringIO()):  # Training prints the same about the data.
+        files = RunData(RunViewOptions(dataparser=options), "val").files["train"]
+        seen = sees_close_ups(focus, files)
+    return seen and not (same and saw_close_ups(read_checkpoint(newest_checkpoint(base / "nerfstudio_models"))))
 
 
 def _open_viewer(base: Path, folder: Path, names: Sequence[str], again: str) -> None:

@@ -67,11 +67,12 @@ class VisibilityGrid:
         for points, class_ids in clouds:
             own = _pack(_voxels(points, origin, voxel_size))
             waiting.append(_distinct(own, class_ids.int(), num_classes))
-            # Merged in few rounds, as each sorts all voxels.
+            # Merge rarely: each merge sorts all voxels.
             if sum(len(pair[0]) for pair in waiting) > len(keys):
                 keys, classes = _merged([(keys, classes), *waiting], num_classes)
                 waiting.clear()
-        keys, classes = _merged([(keys, classes), *waiting], num_classes)
+        if waiting:
+            keys, classes = _merged([(keys, classes), *waiting], num_classes)
         _, voxel, seen = torch.unique(keys, return_inverse=True, return_counts=True)
         alone = seen[voxel] == 1
         return cls(voxel_size, origin, num_classes, keys[alone], classes[alone])

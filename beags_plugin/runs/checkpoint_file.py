@@ -20,7 +20,8 @@ _OF_GAUSSIAN: dict[str, tuple[int | None, ...]] = {
 }  # fmt: skip
 """Shapes of the values of one Gaussian; None: any size."""
 _NOT_FLOATS = ("class_ids", "assigned")
-SAW_CLOSE_UPS = "saw_close_ups"  # Set in a checkpoint of a scene alone if its training saw close-ups.
+STATE = "beags"  # Key of the training's state in a checkpoint, beside nerfstudio's own keys.
+SAW_CLOSE_UPS = "saw_close_ups"  # Key of a checkpoint without that state; true if its training saw close-ups.
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
@@ -59,6 +60,12 @@ def exposures_of(extra: Mapping[str, Any]) -> Exposures | None:
 def scene_alone(checkpoint: dict[str, Any]) -> bool:
     """Return whether the checkpoint lacks the state of a training, as in ``<run>/base`` and extracted runs."""
     return not checkpoint["optimizers"]
+
+
+def saw_close_ups(checkpoint: Mapping[str, Any]) -> bool:
+    """Return whether the training that a checkpoint is of saw close-ups of objects."""
+    views = checkpoint.get(STATE, {}).get("parts", {}).get("views", {})
+    return bool(checkpoint.get(SAW_CLOSE_UPS) or views.get("close_ups"))
 
 
 def model_state(checkpoint: Mapping[str, Any], path: Path) -> dict[str, Any]:

@@ -107,14 +107,14 @@ def focused(
     return CloseUps(close_ups, names, plan.pixels, plan.share, seed, plan.gain)
 
 
-def sees_close_ups(files: PhotoFiles) -> bool:
-    """Return whether a training on these photos and their masks sees close-ups by itself (``focus`` auto)."""
+def sees_close_ups(focus: str, files: PhotoFiles) -> bool:
+    """Return whether a training on these photos and their masks sees close-ups with this value of the option."""
 
     def labels(photo: int) -> Tensor | None:
         mask = files.mask_labels(photo)
         return None if mask is None else torch.from_numpy(mask.astype(np.int32))
 
-    return isinstance(_planned("auto", files, labels), _Plan)
+    return isinstance(_planned(focus, files, labels), _Plan)
 
 
 def _planned(focus: str, files: PhotoFiles, labels: Callable[[int], Tensor | None]) -> _Plan | str | None:

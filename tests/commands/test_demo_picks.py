@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from data_folders import write_image
 from run_folders import write_scene
 
@@ -16,6 +17,7 @@ from beags_plugin.commands import demo, demo_picks, demo_training
 from beags_plugin.commands.cli import main
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.objects import picked_masks
+from beags_plugin.runs.checkpoint_file import SAW_CLOSE_UPS
 from beags_plugin.system.errors import UserError
 
 SIZE = 12, 20  # height and width of the photos
@@ -29,7 +31,9 @@ class Stand:
         (self.data / "classes.json").unlink()
         self.output = root / "out"
         self.said: list[list[str]] = []
-        self.saves, self.code, self.error, self.downscale = True, 0, None, None
+        self.saves, self.code, self.error = True, 0, None
+        self.preset, self.downscale, self.mask = "beags-tiny", None, None
+        self.saw, self.counted = False, []
         monkeypatch.setattr(demo_training, "finish", self.train)
         monkeypatch.setattr(demo_picks, "subprocess", SimpleNamespace(run=self.view))
         monkeypatch.setattr(demo, "measure", lambda *_: self.said.append(["measured"]))
@@ -38,8 +42,12 @@ class Stand:
         self.said.append(words)
         run = Path(words[words.index("--run-dir") + 1])
         (run / "base").mkdir(parents=True)
+        (run / "nerfstudio_models").mkdir()
+        parts = dict.fromkeys(("pipeline", "optimizers", "scalers"), {})
+        torch.save({"step": 9, **parts, SAW_CLOSE_UPS: self.saw}, run / "nerfstudio_models/step-000000009.ckpt")
         (run / "base/config.yml").write_text(words[1])
-        (run / "training.json").write_text(json.dumps({"seconds": {"base training": 3.0}}))
+        seconds = 0.0 if self.kind(words) == "refined" else 3.0
+        (run / "training.json").write_text(json.dumps({"seconds": {"base training": seconds}}))
 
     def view(self, words: list[str], **_) -> SimpleNamespace:
         words = words[words.index("view") :]
@@ -48,15 +56,24 @@ class Stand:
             raise self.error
         if self.saves:
             folder = Path(words[words.index("--save-to") + 1])
-            write_image(folder / "masks/v01.png", np.full(SIZE, len(self.said) % 2, np.uint8))
+            mask = np.full(SIZE, len(self.said) % 2, np.uint8) if self.mask is None else self.mask
+            write_image(folder / "masks/v01.png", mask)
             (folder / "classes.json").write_text('{"1": "bear"}')
             (folder / picked_masks.STAMP).write_text(picked_masks._digest(folder))
         return SimpleNamespace(returncode=self.code)
 
+    def apart(self, config, options, output, things, enlarge) -> list[str]:
+        """Stand in for the separation of things."""
+        self.said.append(["apart", str(config), str(options.masks), str(things), str(enlarge)])
+        mask = np.full(SIZE, len(self.said) % 2, np.uint8) if self.mask is None else self.mask
+        write_image(output / "masks/v01.png", mask)
+        (output / "classes.json").write_text('{"1": "bear 1", "7": "bear 7", "8": "bear 8"}')
+        return ["Only one thing lies apart"]
+
     def run(self, fresh: bool = False, pick: bool = True, objects: int = 1) -> list[str]:
         """Run the demo; return what was started, in a word each."""
         self.said.clear()
-        demo.run_demo(self.data, self.output, "beags-tiny", self.downscale, 0, fresh, pick=pick, objects=objects)
+        demo.run_demo(self.data, self.output, self.preset, self.downscale, 0, fresh, pick=pick, objects=objects)
         return [self.kind(words) for words in self.said]
 
     @staticmethod
@@ -88,46 +105,77 @@ def test_base_viewer_and_refinement_follow_one_another_and_each_is_done_once(sta
     assert stand.run() == ["measured"]
 
 
-def test_close_ups_of_a_small_object_need_a_training_with_its_masks_from_the_beginning(stand, monkeypatch, capsys):
-    seconds: list[dict[str, float]] = []
-    monkeypatch.setattr(demo, "measure", lambda run, output, seconds_of, *_: seconds.append(dict(seconds_of)))
-    small, large = np.zeros((2, *SIZE), np.uint8)
-    small[4:8, 4:10], large[:8] = 1, 1
-    save, chosen = stand.view, [small]
-
-    def view(words, **options):
-        done = save(words, **options)
-        folder = stand.output / "pick"
-        write_image(folder / "masks/v01.png", chosen[0])
-        (folder / picked_masks.STAMP).write_text(picked_masks._digest(folder))
-        return done
-
-    monkeypatch.setattr(demo_picks, "subprocess", SimpleNamespace(run=view))
-    stand.downscale = 2.0
-    assert stand.run() == ["base", "view", "both"]
-    assert "Training begins anew, now with close-ups" in capsys.readouterr().out
-    words = stand.said[2]
-    assert words[words.index("--masks-path") + 1] == str(stand.output / "pick/masks")
-    assert words[words.index("--pipeline.model.prepare.agree") + 1] == "False"
-    assert seconds.pop()["base training"] == 6.0  # of both bases
-    chosen[0] = large
-    assert stand.run(fresh=True) == ["view", "refined"]
-    assert "close-ups" not in capsys.readouterr().out and seconds.pop()["base training"] == 3.0
+@pytest.fixture
+def small(stand, monkeypatch) -> Stand:
+    """A demo in whose photos, which are scaled down, the picked object is small; counted: seconds of each call."""
+    monkeypatch.setattr(demo, "measure", lambda run, output, seconds, *_: stand.counted.append(dict(seconds)))
+    stand.downscale, stand.mask = 2.0, np.zeros(SIZE, np.uint8)
+    stand.mask[4:8, 4:10] = 1
+    return stand
 
 
-def test_things_that_lie_apart_are_told_apart_on_the_base_and_masks_of_them_that_were_mended_stay(
-    stand, monkeypatch, capsys
-):
+def test_close_ups_of_a_small_object_need_a_training_with_its_masks_from_the_beginning(small, capsys):
+    assert small.run() == ["base", "view", "both"]
+    out = capsys.readouterr().out
+    assert "Training starts again, now with close-ups" in out and "layout" not in out
+    words = small.said[2]
+    assert words[words.index("--masks-path") + 1] == str(small.output / "pick/masks")
+    assert small.run() == [] and "close-ups" not in capsys.readouterr().out
+    assert [each["base training"] for each in small.counted] == [6.0, 6.0]  # seconds of both bases
+    small.mask[:8] = 1
+    assert small.run(fresh=True) == ["view", "refined"]
+    assert "close-ups" not in capsys.readouterr().out and small.counted[-1]["base training"] == 3.0
+
+
+def test_a_training_with_close_ups_that_was_interrupted_is_resumed(small, monkeypatch, capsys):
+    train = small.train
+
+    def interrupted(words: list[str]) -> None:
+        train(words)
+        run = Path(words[words.index("--run-dir") + 1])
+        if small.kind(words) == "both":
+            (run / "training.json").unlink()
+            (run / "config.yml").write_text("")
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(demo_training, "finish", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        small.run()
+    capsys.readouterr()
+
+    def resumed(words: list[str]) -> None:
+        small.said.append(words)
+        (small.output / "run/training.json").write_text(json.dumps({"seconds": {"base training": 3.0}}))
+
+    monkeypatch.setattr(demo_training, "finish", resumed)
+    small.run()
+    out = capsys.readouterr().out
+    assert small.said[-1][-2:] == ["resume", str(small.output / "run")]
+    assert "Resuming the training" in out and "close-ups" not in out and small.counted[-1]["base training"] == 6.0
+
+
+def test_a_preset_without_close_ups_refines_the_base(small):
+    small.preset = "beags-paper"
+    assert small.run() == ["base", "view", "refined"]
+
+
+@pytest.fixture
+def separated(stand, monkeypatch) -> None:
+    """A network marks all of each photo, and ``Stand.apart`` separates things."""
     monkeypatch.setattr("beags_plugin.masks.sources.salient.load", lambda _: lambda photo: photo[..., 0] > -1)
     monkeypatch.setattr("beags_plugin.commands.scene_setup.check_source", lambda chosen: None)
+    monkeypatch.setattr("beags_plugin.objects.agree_masks.agree_masks", stand.apart)
 
-    def split(config, options, output, things, enlarge):
-        stand.said.append(["apart", str(config), str(options.masks), str(things), str(enlarge)])
-        write_image(output / "masks/v01.png", np.full(SIZE, len(stand.said) % 2, np.uint8))
-        (output / "classes.json").write_text('{"1": "bear 1", "7": "bear 7", "8": "bear 8"}')
-        return ["Only one thing lies apart"]
 
-    monkeypatch.setattr("beags_plugin.objects.agree_masks.agree_masks", split)
+@pytest.mark.parametrize(("saw", "training"), [(False, "both"), (True, "refined")])
+@pytest.mark.usefixtures("separated")
+def test_things_that_lie_apart_are_trained_again_unless_the_base_saw_close_ups(small, saw, training):
+    small.saw = saw
+    assert small.run(pick=False, objects=3) == ["base", "apart", training]
+
+
+@pytest.mark.usefixtures("separated")
+def test_things_that_lie_apart_are_told_apart_on_the_base_and_masks_of_them_that_were_mended_stay(stand, capsys):
     assert stand.run(pick=False, objects=3) == ["base", "apart", "refined", "measured"]
     assert "Only one thing lies apart" in capsys.readouterr().out
     base, apart, refined, _ = stand.said

@@ -12,9 +12,9 @@ from torch.cuda.amp.grad_scaler import GradScaler
 
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.options.rollback import REPLACED
-from beags_plugin.plugin.training.resumable import STATE, VERSION, Resumable, training_state
+from beags_plugin.plugin.training.resumable import VERSION, Resumable, training_state
 from beags_plugin.plugin.training.scene_model import SceneModel
-from beags_plugin.runs.checkpoint_file import SAW_CLOSE_UPS, model_state, read_checkpoint
+from beags_plugin.runs.checkpoint_file import STATE, model_state, read_checkpoint, saw_close_ups
 from beags_plugin.runs.layout import REPORT_FILE, newest_checkpoint
 from beags_plugin.runs.write import save_atomically
 from beags_plugin.system.errors import UserError
@@ -83,7 +83,7 @@ class Checkpoints:
             model.take_classes(classes)  # Refinement assigns the classes of a base anew.
             states.pop("refinement", None)
         say(f"Loaded {path}")
-        self.loaded_close_ups = bool(checkpoint.get(SAW_CLOSE_UPS) or states.get("views", {}).get("close_ups"))
+        self.loaded_close_ups = saw_close_ups(checkpoint)
         continues = self.config.continues(self.base_dir)
         self.loaded_run = self.base_dir.absolute() if continues else path.absolute().parent.parent
         if model.schedule.base_steps == 0 and int(model.refined_steps) == 0:

@@ -15,12 +15,11 @@ from beags_plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.training.optimizers import SceneOptimizer
 from beags_plugin.plugin.training.timing import StageSeconds
-from beags_plugin.runs.checkpoint_file import scene_alone
+from beags_plugin.runs.checkpoint_file import STATE, scene_alone
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
 
-STATE = "beags"  # Key in a checkpoint, beside nerfstudio's own.
-VERSION = 1  # Version of the state under that key.
+VERSION = 1  # Version of the state under the key ``STATE``.
 
 
 class Resumable(Protocol):
