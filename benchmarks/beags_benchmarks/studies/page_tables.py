@@ -131,6 +131,13 @@ TABLES: tuple[PageTable, ...] = (
         _of_scene("captures-skull", "dtu_skull, given", _ALL),
         _REFINED[:3],
     ),
+    PageTable(
+        "notes/refinement-on-captures.md",
+        "room-768",
+        "room, 768 x 576",
+        _of_scene("room-768", "room768", _ALL),
+        (*_REFINED[:3], "as long as the paper, neither loss", "the paper's losses"),
+    ),
     *(
         PageTable(
             "notes/refinement-on-captures.md",
