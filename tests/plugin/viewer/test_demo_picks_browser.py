@@ -127,7 +127,7 @@ def test_clicks_in_the_viewer_that_the_demo_opens_give_named_objects(tmp_path, m
     assert sorted(names.values()) == ["background", "high", "low"]
     assert (output / "contact_sheet.png").stat().st_size > 10_000
     summary_of_demo = json.loads((output / "summary.json").read_text())
-    assert summary_of_demo["seconds"]["base training"] == 3.0
+    assert summary_of_demo["seconds"]["base training"] == pytest.approx(3.0, abs=0.1)  # refinement adds next to nothing
     surfels, owner = solids(dict.fromkeys(range(3), (0.5,) * 3))
     for name, block in (("low", 1), ("high", 2)):
         means = read_ply(output / f"run/extracted/{name}/{name}.ply")[0].means
