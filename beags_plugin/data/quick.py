@@ -13,23 +13,16 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import load_json
 
 QUICK_PIXELS = 50_000  # most pixels of a view
-MANY = 60  # With fewer photos, which show each part in fewer pixels and get poses sooner, views are larger.
-LARGEST = 3.0  # most pixels of a view of few photos, over ``QUICK_PIXELS``
 
 
 def quick_downscale(data: Path) -> float:
-    """Return the smallest whole factor that scales the images of ``data`` to at most ``QUICK_PIXELS``.
-
-    With fewer than ``MANY`` images these may have as many pixels together as so many have, but none more than
-    ``LARGEST`` times as many.
-    """
-    images = _images(data) or _frames(data)
+    """Return the smallest whole factor that scales the images of ``data`` to at most ``QUICK_PIXELS``."""
+    images = _images(data) or _first_frame(data)
     if not images:
         return 1.0  # the data parser names what is missing
     width, height = image_size(images[0])
-    most = QUICK_PIXELS * min(max(MANY / len(images), 1.0), LARGEST)
     factor = 1
-    while width * height / factor**2 > most:
+    while width * height / factor**2 > QUICK_PIXELS:
         factor += 1
     return float(factor)
 
@@ -46,11 +39,11 @@ def _images(data: Path) -> list[Path]:
     return sorted(path for path in folder.glob(pattern) if path.suffix.lower() in {".jpg", ".jpeg", ".png"})
 
 
-def _frames(data: Path) -> list[Path]:
-    """Return the images of transforms.json that exist; empty without one, or if that file is damaged."""
+def _first_frame(data: Path) -> list[Path]:
+    """Return the first image of transforms.json that exists; empty without one, or if that file is damaged."""
     try:
         names = [str(frame["file_path"]) for frame in load_json(data / "transforms.json")["frames"]]
         files = PhotoFinder([data, data / "images"]).find(names)
     except (OSError, ValueError, LookupError, TypeError, UserError):  # the data parser names what is wrong
         return []
-    return [path for path in files if path is not None]
+    return [path for path in files if path is not None][:1]
