@@ -83,7 +83,7 @@ def test_objects_alone_and_masks_of_some_photos_are_trained_with_close_ups(tmp_p
     write_drawn_scene(data)
     for path in sorted((data / "masks").glob("*.png"))[::2]:
         path.unlink()
-    points = {"pipeline.datamanager.dataparser.num_random_points": 900}  # Surfaces are solid after a few steps.
+    points = {"pipeline.datamanager.dataparser.num_random_points": 900}  # More points make surfaces solid sooner.
     options = {**FOCUSED, **points, "pipeline.datamanager.photos": "objects"}
     run_to_end(short_config(data, tmp_path / "run", **options))
     assert any((tmp_path / "run/prepared/masks" / CLOSE_UPS).glob("*.png"))
