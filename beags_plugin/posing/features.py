@@ -30,7 +30,7 @@ def add_features(database: Any, photos: Sequence[Photo], progress: Callable[[int
     cameras = {_lens_of(photo): known[photo.key] for photo in photos if photo.key in known}
     looks = []
     for photo in counted(photos, len(photos), progress):
-        grey = np.asarray(read_image(photo.path, lambda image: image.convert("L"), "the photo"))
+        grey = np.asarray(read_image(photo.path, lambda image: image.convert("L"), "the photo", enough=LARGEST))
         looks.append(look_at(grey))
         if photo.key in known:
             continue
@@ -39,6 +39,7 @@ def add_features(database: Any, photos: Sequence[Photo], progress: Callable[[int
             ids = read_id_mask(photo.mask, photo.ignore_ids)
             inside = np.uint8(255) * ((ids != BACKGROUND) & (ids != IGNORE))
         points, descriptors = _features(finder, grey, inside)
+        points[:, :3] *= round(photo.width / grey.shape[1])  # the photo may be decoded at a half of its size, or less
         with pycolmap.DatabaseTransaction(database):  # the database gets a photo together with its features
             if _lens_of(photo) not in cameras:
                 cameras[_lens_of(photo)] = _write_camera(database, photo)

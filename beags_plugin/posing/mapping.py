@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import copy
 import tempfile
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
+
+from beags_plugin.posing.features import LARGEST
+from beags_plugin.system.reading.images import read_image
 
 SEED = 0
 AT_ONCE = 40  # pairs between two reports of progress
@@ -100,6 +104,27 @@ def refine(model: Any, progress: Callable[[int, int], None]) -> Any:
     if len(vague) < len(model.cameras):
         _adjust(model, vague, middle=True)
     return model
+
+
+def color_points(model: Any, folder: Path) -> None:
+    """Give each point the mean colour of its features. folder: of the photos, large ones of which are decoded smaller.
+
+    COLMAP's own function decodes each photo whole: 96 photos of 12 megapixels take 15 seconds.
+    """
+    import cv2
+
+    sums: defaultdict[int, np.ndarray] = defaultdict(lambda: np.zeros(4))
+    for image_id in model.reg_image_ids():
+        image = model.images[image_id]
+        photo = read_image(folder / image.name, lambda file: np.array(file.convert("RGB")), "the photo", enough=LARGEST)
+        seen = [point for point in image.points2D if point.has_point3D()]
+        factor = photo.shape[1] / model.cameras[image.camera_id].width
+        places = np.array([point.xy for point in seen], np.float32).reshape(-1, 1, 2) * np.float32(factor) - 0.5
+        colors = cv2.remap(photo, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+        for point, color in zip(seen, colors, strict=True):
+            sums[point.point3D_id] += [*color, 1]
+    for point_id, total in sums.items():
+        model.points3D[point_id].color = np.round(total[:3] / total[3]).astype(np.uint8)
 
 
 def _adjust(model: Any, constant: list[int], middle: bool) -> None:

@@ -13,7 +13,7 @@ from beags_plugin.data.files import list_images
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.posing.features import add_features, coarse_descriptors, forget
 from beags_plugin.posing.files import MODEL, POINTS, TRANSFORMS, write_scene
-from beags_plugin.posing.mapping import match, place, refine
+from beags_plugin.posing.mapping import color_points, match, place, refine
 from beags_plugin.posing.pairs import COARSE, choose_pairs, likeness
 from beags_plugin.posing.photos import (
     FEWEST,
@@ -186,7 +186,7 @@ def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
         )
     with bar("lens") as progress:
         model = refine(models[0], progress)
-    model.extract_colors_for_all_images(output / "images")
+    color_points(model, output / "images")
     groups = [sorted(each.images[image_id].name for image_id in each.reg_image_ids()) for each in models]
     report = _report(photos, looks, model, groups)
     write_scene(output, model)

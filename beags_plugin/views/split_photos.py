@@ -22,6 +22,9 @@ from beags_plugin.views.scene_data import SplitData
 if TYPE_CHECKING:
     from beags_plugin.views.cameras import AnyCameras
 
+AVERAGED = 2
+"""Pixels, along each side, that a decoded photo has for each that is needed; a JPEG's decoder averages the others."""
+
 
 class SplitPhotos:
     """Views of one split: photos, and labels [H, W] uint16, all IGNORE where a view has no mask.
@@ -50,8 +53,8 @@ class SplitPhotos:
 
     def get_numpy_image(self, image_idx: int, path: Path | None = None) -> np.ndarray:
         """Read the image [H, W, 3] uint8, sRGB, before undistortion; path: of another picture of the same view."""
-        path = path or self.image_filenames[image_idx]
-        return resize_area(read_image(path, partial(_colors, path)), *self.file_sizes[image_idx])
+        path, size = path or self.image_filenames[image_idx], self.file_sizes[image_idx]
+        return resize_area(read_image(path, partial(_colors, path), enough=AVERAGED * max(size)), *size)
 
     def get_alpha(self, image_idx: int) -> np.ndarray | None:
         """Read the image's alpha [H, W] uint8, before undistortion; None if it is opaque everywhere."""

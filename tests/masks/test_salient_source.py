@@ -47,6 +47,14 @@ def test_a_thing_is_cut_out_of_training_photos_of_any_shape(tmp_path):
         assert overlap(labels, truth) > 0.9
 
 
+def test_the_mask_of_a_large_photo_has_its_size(tmp_path):
+    photo, truth = coloured(90, 70, left=25)
+    large = Image.fromarray(photo).resize((2160, 1680), Image.Resampling.NEAREST)
+    large.save(tmp_path / "a.jpg", quality=95)
+    _, (labels,) = make(SalientSource(), SourceScene(tmp_path, [Photo("a", tmp_path / "a.jpg", 2160, 1680)]))
+    assert overlap(labels, truth.repeat(24, 0).repeat(24, 1)) > 0.9
+
+
 def test_the_saliency_is_that_of_another_engine(home):
     """OpenCV runs the same file; colours, sides and scale are those that U2-Net was trained with."""
     import cv2

@@ -18,6 +18,7 @@ from beags_plugin.commands.cli import main
 from beags_plugin.posing import features
 from beags_plugin.posing.features import _features as find_features
 from beags_plugin.posing.files import MODEL
+from beags_plugin.posing.photos import Photo
 from beags_plugin.posing.process import REPORT, process
 from beags_plugin.system.reading.ply import read_ply_points
 
@@ -60,6 +61,30 @@ def test_points_lie_before_the_cameras_of_the_same_file(posed):
     report = json.loads((folder / REPORT).read_text())
     assert (report["registered"], report["photos"], report["notes"]) == (12, 12, [])
     assert Image.open(folder / "poses.png").size[0] == 1200
+
+
+def test_points_have_the_colours_that_colmap_gives_them(posed):
+    folder, _ = posed
+    model = pycolmap.Reconstruction(folder / MODEL)
+    ours = {key: point.color.astype(int) for key, point in model.points3D.items()}
+    model.extract_colors_for_all_images(folder / "images")
+    assert max(np.abs(ours[key] - point.color).max() for key, point in model.points3D.items()) <= 1
+
+
+def test_features_of_a_photo_that_is_decoded_smaller_lie_where_they_are_in_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(features, "LARGEST", 320)
+    large = Image.fromarray(photograph(camera(0.6))).resize((1280, 960), Image.Resampling.BICUBIC)
+    points = []
+    for name in ("a.jpg", "a.png"):
+        large.save(tmp_path / name, quality=95)
+        photo = Photo(tmp_path / name, tmp_path / name, 1280, 960, False, None, name)
+        with pycolmap.Database.open(tmp_path / f"{name}.db") as database:
+            features.add_features(database, [photo], lambda done, total: None)
+            points.append(database.read_keypoints(1)[:, :2])
+    offsets = points[0][:, None] - points[1]
+    nearest = offsets[np.arange(len(offsets)), np.square(offsets).sum(2).argmin(1)]
+    near = np.linalg.norm(nearest, axis=1) < 2
+    assert len(points[0]) > 100 and near.mean() > 0.8 and np.abs(np.median(nearest[near], axis=0)).max() < 0.25
 
 
 def test_ns_train_reads_the_scene(posed):

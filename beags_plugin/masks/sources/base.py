@@ -39,9 +39,13 @@ class Photo:
     trained: bool = True
     turned: int = 1
 
-    def pixels(self) -> np.ndarray:
-        """Read the photo, [H, W, 3] uint8 RGB, in writable memory, as torch needs it."""
-        return upright(read_image(self.path, lambda image: np.array(image.convert("RGB"))), self.turned)
+    def pixels(self, enough: int | None = None) -> np.ndarray:
+        """Read the photo, [H, W, 3] uint8 RGB, in writable memory, as torch needs it.
+
+        enough: pixels of its longer side that suffice; it may then be smaller than ``width`` x ``height``.
+        """
+        image = read_image(self.path, lambda image: np.array(image.convert("RGB")), enough=enough)
+        return upright(image, self.turned)
 
     def upright(self) -> Photo:
         """Return the photo turned upright by its EXIF orientation."""

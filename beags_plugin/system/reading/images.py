@@ -22,11 +22,18 @@ MOST_PIXELS = 178_956_970
 T = TypeVar("T")
 
 
-def read_image(path: Path | str, read: Callable[[Image], T], what: str = "the image", remedy: str = "replace it") -> T:
+def read_image(
+    path: Path | str,
+    read: Callable[[Image], T],
+    what: str = "the image",
+    remedy: str = "replace it",
+    enough: int | None = None,
+) -> T:
     """Open an image and return ``read(image)``.
 
-    what: the user's word for the image. remedy: what to do. Raises ``FileNotFoundError``, and ``UserError`` if the file
-    is no such image, is cut off or has too many pixels.
+    what: the user's word for the image. remedy: what to do. enough: pixels of the longer side that suffice; a JPEG of
+    at least twice as many is decoded at 1/2, 1/4 or 1/8 of its size, which is many times faster. Raises
+    ``FileNotFoundError``, and ``UserError`` if the file is no such image, is cut off or has too many pixels.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -41,6 +48,8 @@ def read_image(path: Path | str, read: Callable[[Image], T], what: str = "the im
             width, height = image.size
             if width * height > MOST_PIXELS:
                 raise Image.DecompressionBombError
+            if enough is not None and (longest := max(width, height)) >= 2 * enough:
+                image.draft(None, (max(1, width * enough // longest), max(1, height * enough // longest)))
             return read(image)
     except (UserError, FileNotFoundError):
         raise
