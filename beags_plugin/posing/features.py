@@ -14,7 +14,9 @@ from beags_plugin.system.progress import counted
 from beags_plugin.system.reading.images import read_image
 
 MOST = 8192  # features per photo
-LARGEST = 1200  # pixels of the longer side to which photos are reduced for finding features
+LARGEST = 1200
+"""Pixels of the longer side to which photos are reduced. The database holds points and lenses of reduced photos:
+limits in pixels mean the same for photos of any size."""
 GUESS = 1.2  # focal length, in longest sides, of a photo whose EXIF does not state it
 LENS = "SIMPLE_RADIAL"
 """COLMAP's lens model while photos are added one by one; few parameters keep the solution stable."""
@@ -38,8 +40,7 @@ def add_features(database: Any, photos: Sequence[Photo], progress: Callable[[int
         if photo.mask is not None:
             ids = read_id_mask(photo.mask, photo.ignore_ids)
             inside = np.uint8(255) * ((ids != BACKGROUND) & (ids != IGNORE))
-        points, descriptors = _features(finder, grey, inside)
-        points[:, :3] *= round(photo.width / grey.shape[1])  # the photo may be decoded at a half of its size, or less
+        points, descriptors = _features(finder, grey, inside, reduced_size(photo))
         with pycolmap.DatabaseTransaction(database):  # the database gets a photo together with its features
             if _lens_of(photo) not in cameras:
                 cameras[_lens_of(photo)] = _write_camera(database, photo)
@@ -58,28 +59,35 @@ def forget(database: Any, photos: Sequence[Photo]) -> None:
             database.update_image(image)
 
 
+def reduced_size(photo: Photo) -> tuple[int, int]:
+    """Return width and height of a photo that is reduced to ``LARGEST``."""
+    factor = min(1.0, LARGEST / max(photo.width, photo.height))
+    return max(1, round(photo.width * factor)), max(1, round(photo.height * factor))
+
+
 def _lens_of(photo: Photo) -> tuple[int, int, float | None]:
     return photo.width, photo.height, photo.focal
 
 
-def _features(finder: Any, grey: np.ndarray, inside: np.ndarray | None) -> tuple[np.ndarray, Any]:
+def _features(
+    finder: Any, grey: np.ndarray, inside: np.ndarray | None, size: tuple[int, int]
+) -> tuple[np.ndarray, Any]:
     """Return points [N, 4] float32 (x, y, scale, direction; pixel centres at + 0.5) and COLMAP's RootSIFT [N, 128].
 
-    inside: [H, W] uint8, 0 where no point may lie.
+    inside: [H, W] uint8, 0 where no point may lie. size: width and height to which the photo is reduced first.
     """
     import cv2
     import pycolmap
 
-    factor = min(1.0, LARGEST / max(grey.shape))
-    if factor < 1:
-        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-        inside = None if inside is None else cv2.resize(inside, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    if grey.shape[::-1] != size:
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    if inside is not None and inside.shape[::-1] != size:
+        inside = cv2.resize(inside, size, interpolation=cv2.INTER_NEAREST)
     keypoints, raw = finder.detectAndCompute(grey, inside)
     if raw is None:
         keypoints, raw = (), np.zeros((0, 128), np.float32)
     table = [(one.pt[0] + 0.5, one.pt[1] + 0.5, one.size / 2, np.deg2rad(one.angle)) for one in keypoints]
     points = np.array(table, np.float32).reshape(-1, 4)
-    points[:, :3] /= factor
     roots = np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-9))
     whole = np.minimum(np.round(512 * roots), 255).astype(np.uint8)
     return points, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, whole)
@@ -88,8 +96,9 @@ def _features(finder: Any, grey: np.ndarray, inside: np.ndarray | None) -> tuple
 def _write_camera(database: Any, photo: Photo) -> int:
     import pycolmap
 
-    focal = photo.focal or GUESS * max(photo.width, photo.height)
-    camera = pycolmap.Camera.create_from_model_name(0, LENS, focal, photo.width, photo.height)
+    width, height = reduced_size(photo)
+    focal = GUESS * max(width, height) if photo.focal is None else photo.focal * (width / photo.width)
+    camera = pycolmap.Camera.create_from_model_name(0, LENS, focal, width, height)
     camera.has_prior_focal_length = photo.focal is not None
     camera_id = database.write_camera(camera)
     rig = pycolmap.Rig()

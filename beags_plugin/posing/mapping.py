@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -104,6 +104,21 @@ def refine(model: Any, progress: Callable[[int, int], None]) -> Any:
     if len(vague) < len(model.cameras):
         _adjust(model, vague, middle=True)
     return model
+
+
+def at_photo_size(model: Any, sizes: Mapping[str, tuple[int, int]]) -> None:
+    """Change lenses and points of reduced photos to those of the photos. sizes: width and height by photo."""
+    for camera_id, camera in model.cameras.items():
+        images = [image for image in model.images.values() if image.camera_id == camera_id]
+        width, height = sizes[images[0].name]
+        factors = np.array([width / camera.width, height / camera.height])
+        if (factors == 1).all():
+            continue
+        camera.rescale(width, height)
+        for image in images:
+            for point in image.points2D:
+                point.xy = point.xy * factors
+    model.update_point_3d_errors()
 
 
 def color_points(model: Any, folder: Path) -> None:

@@ -13,7 +13,7 @@ from beags_plugin.data.files import list_images
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.posing.features import add_features, coarse_descriptors, forget
 from beags_plugin.posing.files import MODEL, POINTS, TRANSFORMS, write_scene
-from beags_plugin.posing.mapping import color_points, match, place, refine
+from beags_plugin.posing.mapping import at_photo_size, color_points, match, place, refine
 from beags_plugin.posing.pairs import COARSE, choose_pairs, likeness
 from beags_plugin.posing.photos import (
     FEWEST,
@@ -33,7 +33,7 @@ from beags_plugin.system.progress import Bar
 from beags_plugin.system.whole_files import write_text_atomically
 
 REPORT = "poses.json"
-VERSION = 1  # version of the saved state; a state of another version is discarded
+VERSION = 2  # version of the saved state; a state of another version is discarded
 WORK = Path("colmap")
 DATABASE = "database.db"
 KEPT = "kept.json"
@@ -186,6 +186,7 @@ def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
         )
     with bar("lens") as progress:
         model = refine(models[0], progress)
+    at_photo_size(model, {photo.path.name: (photo.width, photo.height) for photo in photos})
     color_points(model, output / "images")
     groups = [sorted(each.images[image_id].name for image_id in each.reg_image_ids()) for each in models]
     report = _report(photos, looks, model, groups)

@@ -83,8 +83,23 @@ def test_features_of_a_photo_that_is_decoded_smaller_lie_where_they_are_in_it(tm
             points.append(database.read_keypoints(1)[:, :2])
     offsets = points[0][:, None] - points[1]
     nearest = offsets[np.arange(len(offsets)), np.square(offsets).sum(2).argmin(1)]
-    near = np.linalg.norm(nearest, axis=1) < 2
-    assert len(points[0]) > 100 and near.mean() > 0.8 and np.abs(np.median(nearest[near], axis=0)).max() < 0.25
+    near = np.linalg.norm(nearest, axis=1) < 0.5
+    assert len(points[0]) > 100 and near.mean() > 0.8 and np.abs(np.median(nearest[near], axis=0)).max() < 0.07
+
+
+def test_photos_that_are_reduced_get_the_lens_and_the_points_of_their_own_size(tmp_path, monkeypatch):
+    monkeypatch.setattr(features, "LARGEST", 321)
+    given = write_photos(tmp_path / "photos", enlarged=2)
+    process(tmp_path / "photos", tmp_path / "scene", quiet)
+    turned, _ = errors(frames(tmp_path / "scene"), given)
+    meta = json.loads((tmp_path / "scene/transforms.json").read_text())
+    assert np.median(turned) < 0.3 and (meta["w"], meta["h"]) == (640, 480)
+    assert [meta["fl_x"], meta["fl_y"]] == pytest.approx([600, 600], rel=0.02)
+    model = pycolmap.Reconstruction(tmp_path / "scene" / MODEL)
+    image = next(iter(model.images.values()))
+    seen = [(point.xy, model.points3D[point.point3D_id].xyz) for point in image.points2D if point.has_point3D()]
+    off = [np.linalg.norm(image.project_point(xyz) - xy) for xy, xyz in seen]
+    assert max(point[0] for point, _ in seen) > 400 and np.median(off) < 1.5
 
 
 def test_ns_train_reads_the_scene(posed):

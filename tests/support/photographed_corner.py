@@ -60,14 +60,18 @@ def photograph(
     return image
 
 
-def write_photos(folder: Path, count: int = 12, prefix: str = "v", **settings) -> dict[str, np.ndarray]:
-    """Write photos on an arc; returns the pose of each by the stem of its file."""
+def write_photos(
+    folder: Path, count: int = 12, prefix: str = "v", enlarged: int = 1, **settings
+) -> dict[str, np.ndarray]:
+    """Write photos on an arc, enlarged so many times; returns the pose of each by the stem of its file."""
     folder.mkdir(parents=True, exist_ok=True)
     poses = {}
     for index, angle in enumerate(np.linspace(0.25, 1.3, count)):
         name = f"{prefix}{index:02d}"
         poses[name] = camera(float(angle), 1.2 + 0.4 * (index % 3))
-        Image.fromarray(photograph(poses[name], **settings)).save(folder / f"{name}.png")
+        picture = Image.fromarray(photograph(poses[name], **settings))
+        size = picture.width * enlarged, picture.height * enlarged
+        picture.resize(size, Image.Resampling.BICUBIC).save(folder / f"{name}.png")
     return poses
 
 
