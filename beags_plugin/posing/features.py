@@ -9,11 +9,13 @@ import numpy as np
 
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.labels.classes import read_id_mask
+from beags_plugin.posing.pairs import ALL
 from beags_plugin.posing.photos import Look, Photo, look_at
 from beags_plugin.system.progress import counted
 from beags_plugin.system.reading.images import read_image
 
-MOST = 8192  # features per photo
+MOST = 8192  # features per photo; a few photos far apart need that many
+MOST_OF_MANY = 4096  # features of each of more than ``ALL`` photos: half the time, and the poses are as good
 LARGEST = 1200
 """Pixels of the longer side to which photos are reduced. The database holds points and lenses of reduced photos:
 limits in pixels mean the same for photos of any size."""
@@ -27,7 +29,8 @@ def add_features(database: Any, photos: Sequence[Photo], progress: Callable[[int
     import cv2
     import pycolmap
 
-    finder = cv2.SIFT.create(nfeatures=MOST, contrastThreshold=0.02, enable_precise_upscale=True)
+    most = MOST if len(photos) <= ALL else min(MOST, MOST_OF_MANY)
+    finder = cv2.SIFT.create(nfeatures=most, contrastThreshold=0.02, enable_precise_upscale=True)
     known = {image.name: image.camera_id for image in database.read_all_images()}
     cameras = {_lens_of(photo): known[photo.key] for photo in photos if photo.key in known}
     looks = []
