@@ -151,7 +151,7 @@ TABLES: tuple[PageTable, ...] = (
     PageTable(
         "docs/results.md",
         "captures-length",
-        "digger, 480 pixels",
+        "digger, 779 pixels",
         _of_scene("captures-length", DIGGER, _ALL),
         (
             "assignment alone",
