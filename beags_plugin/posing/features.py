@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,6 @@ from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.posing.pairs import ALL
 from beags_plugin.posing.photos import Look, Photo, look_at
-from beags_plugin.system.progress import counted
 from beags_plugin.system.reading.images import read_image
 
 MOST = 8192  # features per photo; a few photos far apart need that many
@@ -19,6 +20,8 @@ MOST_OF_MANY = 4096  # features of each of more than ``ALL`` photos: half the ti
 LARGEST = 1200
 """Pixels of the longer side to which photos are reduced. The database holds points and lenses of reduced photos:
 limits in pixels mean the same for photos of any size."""
+WORKERS = 2  # photos at once; OpenCV uses little more than one core for a photo, and 0.5 GB at most
+AHEAD = 8  # photos read before their features are written
 GUESS = 1.2  # focal length, in longest sides, of a photo whose EXIF does not state it
 LENS = "SIMPLE_RADIAL"
 """COLMAP's lens model while photos are added one by one; few parameters keep the solution stable."""
@@ -26,31 +29,40 @@ LENS = "SIMPLE_RADIAL"
 
 def add_features(database: Any, photos: Sequence[Photo], progress: Callable[[int, int], None]) -> list[Look]:
     """Add photos and their features to a database, except photos that it holds; returns the look of every photo."""
-    import cv2
     import pycolmap
 
     most = MOST if len(photos) <= ALL else min(MOST, MOST_OF_MANY)
-    finder = cv2.SIFT.create(nfeatures=most, contrastThreshold=0.02, enable_precise_upscale=True)
     known = {image.name: image.camera_id for image in database.read_all_images()}
     cameras = {_lens_of(photo): known[photo.key] for photo in photos if photo.key in known}
     looks = []
-    for photo in counted(photos, len(photos), progress):
-        grey = np.asarray(read_image(photo.path, lambda image: image.convert("L"), "the photo", enough=LARGEST))
-        looks.append(look_at(grey))
-        if photo.key in known:
-            continue
-        inside = None
-        if photo.mask is not None:
-            ids = read_id_mask(photo.mask, photo.ignore_ids)
-            inside = np.uint8(255) * ((ids != BACKGROUND) & (ids != IGNORE))
-        points, descriptors = _features(finder, grey, inside, reduced_size(photo))
-        with pycolmap.DatabaseTransaction(database):  # the database gets a photo together with its features
-            if _lens_of(photo) not in cameras:
-                cameras[_lens_of(photo)] = _write_camera(database, photo)
-            image_id = _write_image(database, photo.key, cameras[_lens_of(photo)])
-            database.write_keypoints(image_id, points)
-            database.write_descriptors(image_id, descriptors)
+    for first in range(0, len(photos), AHEAD):
+        some = photos[first : first + AHEAD]
+        with ThreadPoolExecutor(WORKERS) as pool:
+            seen = pool.map(partial(_seen, most=most), some, [photo.key not in known for photo in some])
+            for photo, (look, features) in zip(some, seen, strict=True):
+                looks.append(look)
+                progress(len(looks), len(photos))
+                if features is None:
+                    continue
+                with pycolmap.DatabaseTransaction(database):  # the database gets a photo together with its features
+                    if _lens_of(photo) not in cameras:
+                        cameras[_lens_of(photo)] = _write_camera(database, photo)
+                    image_id = _write_image(database, photo.key, cameras[_lens_of(photo)])
+                    database.write_keypoints(image_id, features[0])
+                    database.write_descriptors(image_id, features[1])
     return looks
+
+
+def _seen(photo: Photo, new: bool, most: int) -> tuple[Look, tuple[np.ndarray, Any] | None]:
+    """Return the look of a photo and, if it is new, at most ``most`` features."""
+    grey = np.asarray(read_image(photo.path, lambda image: image.convert("L"), "the photo", enough=LARGEST))
+    if not new:
+        return look_at(grey), None
+    inside = None
+    if photo.mask is not None:
+        ids = read_id_mask(photo.mask, photo.ignore_ids)
+        inside = np.uint8(255) * ((ids != BACKGROUND) & (ids != IGNORE))
+    return look_at(grey), _features(grey, inside, reduced_size(photo), most)
 
 
 def forget(database: Any, photos: Sequence[Photo]) -> None:
@@ -72,12 +84,11 @@ def _lens_of(photo: Photo) -> tuple[int, int, float | None]:
     return photo.width, photo.height, photo.focal
 
 
-def _features(
-    finder: Any, grey: np.ndarray, inside: np.ndarray | None, size: tuple[int, int]
-) -> tuple[np.ndarray, Any]:
+def _features(grey: np.ndarray, inside: np.ndarray | None, size: tuple[int, int], most: int) -> tuple[np.ndarray, Any]:
     """Return points [N, 4] float32 (x, y, scale, direction; pixel centres at + 0.5) and COLMAP's RootSIFT [N, 128].
 
-    inside: [H, W] uint8, 0 where no point may lie. size: width and height to which the photo is reduced first.
+    N is ``most`` or less. inside: [H, W] uint8, 0 where no point may lie. size: width and height to which the photo is
+    reduced first.
     """
     import cv2
     import pycolmap
@@ -86,6 +97,7 @@ def _features(
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     if inside is not None and inside.shape[::-1] != size:
         inside = cv2.resize(inside, size, interpolation=cv2.INTER_NEAREST)
+    finder = cv2.SIFT.create(nfeatures=most, contrastThreshold=0.02, enable_precise_upscale=True)
     keypoints, raw = finder.detectAndCompute(grey, inside)
     if raw is None:
         keypoints, raw = (), np.zeros((0, 128), np.float32)

@@ -161,6 +161,7 @@ def _problem(model: Any, constant: list[int], middle: bool) -> Any:
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.loss_function_scale = 1.0  # pixel
     options.ceres.solver_options.function_tolerance = 1e-6  # hundreds of photos take minutes otherwise
+    options.ceres.solver_options.num_threads = 1  # more add in another order each time, and save 4 % of the time
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)

@@ -22,7 +22,7 @@ from beags_plugin.views.scene_data import SplitData
 if TYPE_CHECKING:
     from beags_plugin.views.cameras import AnyCameras
 
-AVERAGED = 2
+AVERAGED = 4
 """Pixels, along each side, that a decoded photo has for each that is needed; a JPEG's decoder averages the others."""
 
 

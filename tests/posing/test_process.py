@@ -155,7 +155,7 @@ def test_a_call_that_was_cut_off_goes_on_to_the_same_poses(posed, tmp_path, monk
     monkeypatch.setattr(features, "_features", lambda *_: pytest.fail("computed again"))
     monkeypatch.setattr("beags_plugin.posing.process.likeness", lambda *_: pytest.fail("chosen again"))
     process(photos, folder, quiet)
-    assert len(computed) == 13  # the sixth twice
+    assert 13 <= len(computed) <= 12 + features.AHEAD  # the sixth twice, perhaps those that were read ahead too
     assert (folder / "transforms.json").read_bytes() == (posed[0] / "transforms.json").read_bytes()
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, TypeVar
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.images import read_image
 
 Progress = Callable[[int, int], None]
+T = TypeVar("T")
 
 
 class NothingFound(UserError):
@@ -164,9 +166,11 @@ class MaskSource(ABC):
 def per_photo(
     scene: SourceScene, progress: Progress, read: Callable[[Photo], np.ndarray | None]
 ) -> Iterator[np.ndarray | None]:
-    """Yield ``read`` of each photo, with progress; raise ``UserError`` for labels of another size than the photo."""
-    for index, photo in enumerate(scene.photos):
-        labels = read(photo)
+    """Yield ``read`` of each photo, with progress; raise ``UserError`` for labels of another size than the photo.
+
+    The next photo is read in a thread while the caller writes the labels of this one.
+    """
+    for index, (photo, labels) in enumerate(zip(scene.photos, _ahead(read, scene.photos), strict=True)):
         if labels is not None and labels.shape != (photo.height, photo.width):
             size = labels.shape[1], labels.shape[0]
             if sentence := upright_mask_error("made here", size, photo.path, (photo.width, photo.height)):
@@ -177,6 +181,18 @@ def per_photo(
             )
         yield labels
         progress(index + 1, len(scene.photos))
+
+
+def _ahead(read: Callable[[Photo], T], photos: Sequence[Photo]) -> Iterator[T]:
+    """Yield ``read`` of each photo; one is read ahead."""
+    with ThreadPoolExecutor(1) as pool:
+        following: Future[T] | None = None
+        for photo in photos:
+            current, following = following, pool.submit(read, photo)
+            if current is not None:
+                yield current.result()
+        if following is not None:
+            yield following.result()
 
 
 def stacked(objects: Sequence[tuple[int, np.ndarray]], shape: tuple[int, ...]) -> np.ndarray:
