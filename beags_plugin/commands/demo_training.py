@@ -16,6 +16,7 @@ from beags_plugin.commands.scene_setup import MadeScene
 from beags_plugin.system.child_processes import bound
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.lock import run_lock
+from beags_plugin.system.memory import trim_memory
 from beags_plugin.system.pasted import command, quoted
 from beags_plugin.system.whole_files import write_text_atomically
 
@@ -113,6 +114,7 @@ def quiet_environment() -> dict[str, str]:
 
 def finish(words: list[str]) -> None:
     """Run a training; raises ``UserError`` where it fails."""
+    trim_memory()  # This process waits meanwhile.
     code = subprocess.run(bound(words), env=quiet_environment()).returncode
     if code != 0:
         raise UserError(f"training ended with exit code {code}; what it printed above says why.")

@@ -21,6 +21,7 @@ from beags_plugin.posing.turned import ENOUGH, objects_seem_turned, poses_are_th
 from beags_plugin.posing.video import is_video
 from beags_plugin.system.digests import content_digest, folder_digest
 from beags_plugin.system.errors import UserError
+from beags_plugin.system.memory import trim_memory
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_text_atomically
 
@@ -135,6 +136,7 @@ def made_scene(data: Path, output: Path, masks: bool = True, chosen: ChosenSourc
 def _print_poses(data: Path, scene: Path, masks: Path | None = None) -> None:
     for line in find_poses(data, scene, nullcontext(), masks):
         CONSOLE.print(line)
+    trim_memory()  # Masks come next, in the same process.
 
 
 def _scene_of_objects(

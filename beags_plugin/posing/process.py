@@ -29,6 +29,7 @@ from beags_plugin.posing.photos import (
 from beags_plugin.posing.video import find_frames, is_video, write_frames
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.lock import run_lock
+from beags_plugin.system.memory import trim_memory
 from beags_plugin.system.progress import Bar
 from beags_plugin.system.whole_files import write_text_atomically
 
@@ -166,6 +167,7 @@ def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
     copy_photos(photos, bar)
     with bar("features") as progress:
         looks = add_features(database, photos, progress)
+    trim_memory()  # The pyramids of large photos take 0.7 GB.
     if not kept.paired:
         with bar("pairs") as progress:
             ids = [database.read_image_with_name(photo.key).image_id for photo in photos]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from contextlib import suppress
 from pathlib import Path
 
@@ -19,6 +20,12 @@ def peak_memory_mb() -> float:
         status = Path("/proc/self/status").read_text().splitlines()
         return int(next(line for line in status if line.startswith("VmHWM:")).split()[1]) * 1024 / 1e6
     return memory_mb()
+
+
+def trim_memory() -> None:
+    """Give freed memory back to the system, of which glibc keeps most; does nothing with other C libraries."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def available_mb() -> float:
