@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -14,13 +13,14 @@ from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.posing.pairs import ALL
 from beags_plugin.posing.photos import Look, Photo, look_at
 from beags_plugin.system.reading.images import read_image
+from beags_plugin.system.threads import worker_threads
 
 MOST = 8192  # features per photo; a few photos far apart need that many
-MOST_OF_MANY = 4096  # features of each of more than ``ALL`` photos: half the time, and the poses are as good
+MOST_OF_MANY = 4096  # features of each of more than ``ALL`` photos: half the time, poses about as good (notes/poses.md)
 LARGEST = 1200
 """Pixels of the longer side to which photos are reduced. The database holds points and lenses of reduced photos:
 limits in pixels mean the same for photos of any size."""
-WORKERS = 2  # photos at once; OpenCV uses little more than one core for a photo, and 0.5 GB at most
+WORKERS = 2  # photos at once; OpenCV uses little more than one core for a photo, and 0.5 GB for a large one
 AHEAD = 8  # photos read before their features are written
 GUESS = 1.2  # focal length, in longest sides, of a photo whose EXIF does not state it
 LENS = "SIMPLE_RADIAL"
@@ -37,7 +37,7 @@ def add_features(database: Any, photos: Sequence[Photo], progress: Callable[[int
     looks = []
     for first in range(0, len(photos), AHEAD):
         some = photos[first : first + AHEAD]
-        with ThreadPoolExecutor(WORKERS) as pool:
+        with worker_threads(WORKERS) as pool:
             seen = pool.map(partial(_seen, most=most), some, [photo.key not in known for photo in some])
             for photo, (look, features) in zip(some, seen, strict=True):
                 looks.append(look)

@@ -132,7 +132,8 @@ def color_points(model: Any, folder: Path) -> None:
     for image_id in model.reg_image_ids():
         image = model.images[image_id]
         photo = read_image(folder / image.name, lambda file: np.array(file.convert("RGB")), "the photo", enough=LARGEST)
-        seen = [point for point in image.points2D if point.has_point3D()]
+        if not (seen := [point for point in image.points2D if point.has_point3D()]):
+            continue
         factor = photo.shape[1] / model.cameras[image.camera_id].width
         places = np.array([point.xy for point in seen], np.float32).reshape(-1, 1, 2) * np.float32(factor) - 0.5
         colors = cv2.remap(photo, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]

@@ -167,7 +167,7 @@ def _process(photos: list[Photo], output: Path, bar: Bar) -> tuple[Posed, Any]:
     copy_photos(photos, bar)
     with bar("features") as progress:
         looks = add_features(database, photos, progress)
-    trim_memory()  # The pyramids of large photos take 0.7 GB.
+    trim_memory()  # The pyramids of two large photos take 0.7 GB and more.
     if not kept.paired:
         with bar("pairs") as progress:
             ids = [database.read_image_with_name(photo.key).image_id for photo in photos]

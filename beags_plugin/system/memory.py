@@ -24,7 +24,7 @@ def peak_memory_mb() -> float:
 
 def trim_memory() -> None:
     """Give freed memory back to the system, of which glibc keeps most; does nothing with other C libraries."""
-    with suppress(OSError, AttributeError):
+    with suppress(OSError, AttributeError, TypeError):  # TypeError: Windows has no such library
         ctypes.CDLL(None).malloc_trim(0)
 
 

@@ -17,7 +17,8 @@ from beags_plugin.views.split_photos import AVERAGED, resize_area
         ((800, 600), 201, (400, 300)),
         ((600, 800), 300, (300, 400)),
         ((800, 600), 401, (800, 600)),
-        ((801, 533), 200, (201, 134)),
+        ((800, 602), 200, (400, 301)),
+        ((801, 533), 200, (801, 533)),
         ((800, 600), 10, (100, 75)),
         ((800, 600), None, (800, 600)),
     ],
@@ -35,6 +36,6 @@ def test_a_photo_of_the_training_size_looks_the_same(tmp_path):
     Image.fromarray(noise).resize((1600, 1200), Image.Resampling.BICUBIC).save(tmp_path / "a.jpg", quality=95)
     whole = resize_area(read_image(tmp_path / "a.jpg", np.array), 100, 75)
     small = read_image(tmp_path / "a.jpg", np.array, enough=AVERAGED * 100)
-    assert small.shape == (150, 200, 3)
+    assert small.shape == (75 * AVERAGED, 100 * AVERAGED, 3)
     difference = resize_area(small, 100, 75).astype(int) - whole
     assert abs(difference.mean()) < 0.5 and np.abs(difference).mean() < 1.5

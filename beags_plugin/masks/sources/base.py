@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +17,7 @@ from beags_plugin.data.orientation import LYING, orientation, upright, upright_m
 from beags_plugin.masks.sources.matching import PhotoNames
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.images import read_image
+from beags_plugin.system.threads import worker_threads
 
 Progress = Callable[[int, int], None]
 T = TypeVar("T")
@@ -185,7 +186,7 @@ def per_photo(
 
 def _ahead(read: Callable[[Photo], T], photos: Sequence[Photo]) -> Iterator[T]:
     """Yield ``read`` of each photo; one is read ahead."""
-    with ThreadPoolExecutor(1) as pool:
+    with worker_threads(1) as pool:
         following: Future[T] | None = None
         for photo in photos:
             current, following = following, pool.submit(read, photo)

