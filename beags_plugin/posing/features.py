@@ -97,7 +97,7 @@ def _features(grey: np.ndarray, inside: np.ndarray | None, size: tuple[int, int]
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     if inside is not None and inside.shape[::-1] != size:
         inside = cv2.resize(inside, size, interpolation=cv2.INTER_NEAREST)
-    finder = cv2.SIFT.create(nfeatures=most, contrastThreshold=0.02, enable_precise_upscale=True)
+    finder: Any = cv2.SIFT.create(nfeatures=most, contrastThreshold=0.02, enable_precise_upscale=True)
     keypoints, raw = finder.detectAndCompute(grey, inside)
     if raw is None:
         keypoints, raw = (), np.zeros((0, 128), np.float32)

@@ -136,7 +136,7 @@ def color_points(model: Any, folder: Path) -> None:
             continue
         factor = photo.shape[1] / model.cameras[image.camera_id].width
         places = np.array([point.xy for point in seen], np.float32).reshape(-1, 1, 2) * np.float32(factor) - 0.5
-        colors = cv2.remap(photo, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+        colors = cv2.remap(photo, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
         for point, color in zip(seen, colors, strict=True):
             sums[point.point3D_id] += [*color, 1]
     for point_id, total in sums.items():

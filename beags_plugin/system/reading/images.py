@@ -52,10 +52,8 @@ def read_image(
             width, height = image.size
             if width * height > MOST_PIXELS:
                 raise Image.DecompressionBombError
-            for part in (8, 4, 2) if enough is not None else ():
-                if max(width, height) >= part * enough and width % part == height % part == 0:
-                    image.draft(None, (width // part, height // part))
-                    break
+            if enough is not None and (part := _part(width, height, enough)) > 1:
+                image.draft(None, (width // part, height // part))
             return read(image)
     except (UserError, FileNotFoundError):
         raise
@@ -67,3 +65,9 @@ def read_image(
         raise broken(f"it promises more than {MOST_PIXELS:,} pixels") from error
     except Exception as error:  # Pillow passes on all errors of the readers of single formats
         raise broken(reason(error)) from error
+
+
+def _part(width: int, height: int, enough: int) -> int:
+    """Return the largest of 8, 4, 2 and 1 that divides both sides and leaves ``enough`` pixels of the longer one."""
+    fits = (part for part in (8, 4, 2) if width % part == height % part == 0 and max(width, height) >= part * enough)
+    return next(fits, 1)
