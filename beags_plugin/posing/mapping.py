@@ -135,8 +135,8 @@ def color_points(model: Any, folder: Path) -> None:
         if not (seen := [point for point in image.points2D if point.has_point3D()]):
             continue
         factor = photo.shape[1] / model.cameras[image.camera_id].width
-        places = np.array([point.xy for point in seen], np.float32).reshape(-1, 1, 2) * np.float32(factor) - 0.5
-        colors = cv2.remap(photo, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+        x, y = (np.array([point.xy for point in seen], np.float32) * np.float32(factor) - 0.5).T[..., None]
+        colors = cv2.remap(photo, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
         for point, color in zip(seen, colors, strict=True):
             sums[point.point3D_id] += [*color, 1]
     for point_id, total in sums.items():
