@@ -25,7 +25,7 @@ LENS = "OPENCV"
 ROUNDS = 3  # rounds of the last adjustment; each drops the points that the one before has shown to be wrong
 MIDDLE_KNOWN = 0.03  # degrees of standard deviation below which the principal point counts as determined
 MIDDLE_CLEAR = 30.0  # standard deviations from the middle of the photo beyond which it counts too
-LARGEST_ERROR = 2.0  # pixels
+LARGEST_ERROR = 2.0  # pixels of reduced photos, as all pixels here
 SMALLEST_ANGLE = 1.5  # degrees
 
 
@@ -160,7 +160,7 @@ def _problem(model: Any, constant: list[int], middle: bool) -> Any:
 
     options = pycolmap.BundleAdjustmentOptions(refine_principal_point=middle, print_summary=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.loss_function_scale = 1.0  # pixel
+    options.ceres.loss_function_scale = 1.0  # pixel of a reduced photo
     options.ceres.solver_options.function_tolerance = 1e-6  # hundreds of photos take minutes otherwise
     options.ceres.solver_options.num_threads = 1  # more add in another order each time, and save 4 % of the time
     config = pycolmap.BundleAdjustmentConfig()
