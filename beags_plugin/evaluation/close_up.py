@@ -7,16 +7,18 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from beags_plugin.evaluation.metrics import CloseUpMetrics, MaskMetrics, band_width, psnr
 from beags_plugin.evaluation.records import EvalView
 from beags_plugin.evaluation.truths import extracted_truth, rendered_truth, resized
 from beags_plugin.labels.borders import at_border
-from beags_plugin.losses.photometric import ssim_map
+from beags_plugin.losses.photometric import WINDOW, ssim_map
 
 MARGIN = 0.5
 """Margin around the object's box, as a share of its longer side; spill farther off is not in the close-up."""
+STRIP = 256  # rows whose SSIM is computed at once
 
 
 def close_up(view: EvalView, class_id: int) -> EvalView | None:
@@ -69,8 +71,18 @@ def close_up_metrics(part: EvalView, class_id: int, color: Tensor, agreement: Ma
     if not inside.any():
         return metrics
     photo, inside = part.image.to(color), inside.to(color.device)
-    similar = float(ssim_map(color, photo)[inside].mean())
+    similar = float(_similarity(color, photo, inside).mean())
     return replace(metrics, psnr=psnr(color[inside], photo[inside]), ssim=similar)
+
+
+def _similarity(color: Tensor, photo: Tensor, inside: Tensor) -> Tensor:
+    """Return the SSIM at the pixels ``inside`` [h, w] bool, in strips: whole, 12 megapixels take 4 GB."""
+    parts = []
+    for top in range(0, len(inside), STRIP):
+        first, rows = max(top - WINDOW // 2, 0), inside[top : top + STRIP]
+        part = slice(first, top + STRIP + WINDOW // 2)
+        parts.append(ssim_map(color[part], photo[part])[top - first :][: len(rows)][rows])
+    return torch.cat(parts)
 
 
 def _box(mask: Tensor) -> tuple[int, int, int, int]:

@@ -22,7 +22,7 @@ from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.surfaces.frames import bounding_box
 
 COLUMNS = 6  # cells in a line
-SMALLEST, LARGEST = 150, 480  # bounds for the side of a cell, pixels
+SMALLEST, LARGEST = 300, 480  # bounds for the side of a cell, pixels
 FAINT = 0.1  # alpha from which a stray Gaussian widens the crop
 STRAYS = 1.3  # most that strays of earlier stages widen the crop of the last one, times its side
 _VIEWS = 2  # views in a line, each with photo, before and after

@@ -13,13 +13,14 @@ from rich.console import Console
 
 from beags_plugin.core.cameras import cropped
 from beags_plugin.core.membership import Membership
-from beags_plugin.evaluation.close_up import MARGIN
+from beags_plugin.evaluation.close_up import MARGIN, _similarity
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView, FullPhoto, SceneMetrics
 from beags_plugin.evaluation.report import RunMetrics
 from beags_plugin.evaluation.run_metrics import evaluate_scene
 from beags_plugin.evaluation.table import render_run
 from beags_plugin.labels.class_ids import IGNORE
+from beags_plugin.losses.photometric import ssim_map
 
 FINE = 4  # files of photos are so many times as large as training photos
 IDS = torch.tensor([1, 2, 0], dtype=torch.int32)
@@ -119,3 +120,11 @@ def test_the_table_and_the_files_have_it():
     plain = replace(run, after=evaluated([CUP, BOX, FLOOR], IDS, replace(view(), full=None)))
     Console(file=(out := io.StringIO()), width=100).print(render_run(plain))
     assert "own size" not in out.getvalue()
+
+
+def test_similarity_in_strips_is_that_of_the_whole_picture(monkeypatch):
+    generator = torch.Generator().manual_seed(0)
+    color, photo = (torch.rand((40, 23, 3), generator=generator) for _ in range(2))
+    inside = torch.rand((40, 23), generator=generator) < 0.4
+    monkeypatch.setattr("beags_plugin.evaluation.close_up.STRIP", 7)
+    assert torch.equal(_similarity(color, photo, inside), ssim_map(color, photo)[inside])

@@ -17,7 +17,16 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.records import EvalView, FullPhoto
 from beags_plugin.pictures.cells import GAP, write_picture
 from beags_plugin.pictures.contact_sheet import contact_sheet
-from beags_plugin.pictures.object_cells import COLUMNS, LARGEST, STRAYS, Drawing, cell_size, object_shots, views_of
+from beags_plugin.pictures.object_cells import (
+    COLUMNS,
+    LARGEST,
+    SMALLEST,
+    STRAYS,
+    Drawing,
+    cell_size,
+    object_shots,
+    views_of,
+)
 from beags_plugin.pictures.orbit import least_shown, orbit, orbit_frame, orbit_settings, side, view_from
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.system.errors import UserError
@@ -101,14 +110,14 @@ def test_a_sheet_has_full_lines_and_no_empty_cell(tmp_path, masked):
 
 
 def test_an_object_fills_two_lines_and_has_the_pixels_of_the_photos_files():
-    held_out = views(full=3)
+    held_out = views(full=6)
     sheet = object_cells(1, "ball", {"before": ball(), "after": ball(0.2)}, held_out, photos(), BALLS)
     size = sheet.shape[1] // COLUMNS - GAP
-    assert 150 < size < 3 * 64 * 1.4
+    assert SMALLEST < size < 6 * 64 * 1.4
     lines = cells(sheet, size)
     assert [len(line) for line in lines] == [COLUMNS, COLUMNS]
     assert all(cell.std() > 1 for line in lines for cell in line)
-    regions = [view.full.region((0, 0, 192, 192))[1] for view in held_out if view.full is not None]
+    regions = [view.full.region((0, 0, 384, 384))[1] for view in held_out if view.full is not None]
     rows = [row.tobytes() for image in regions for row in (image * 255).round().byte().numpy()]
     photo = lines[0][0]
     inside = photo[(photo < 255).any(axis=(1, 2))]
@@ -121,9 +130,9 @@ def test_lines_of_objects_of_different_size_end_together():
         i: {"before": moved(ball(), 0.0, 0.0, 0.0, size=size), "after": moved(ball(0.2), 0.0, 0.0, 0.0, size=size)}
         for i, size in enumerate(sizes, start=1)
     }
-    shots = [object_shots(i, f"object {i}", stages, views(full=6), photos(), BALLS) for i, stages in objects.items()]
+    shots = [object_shots(i, f"object {i}", stages, views(full=8), photos(), BALLS) for i, stages in objects.items()]
     assert shots[0].pixels < shots[1].pixels < shots[2].pixels and cell_size(shots) == shots[1].pixels
-    sheet = contact_sheet(views(full=6), photos(), ball(), objects, {}, BALLS)
+    sheet = contact_sheet(views(full=8), photos(), ball(), objects, {}, BALLS)
     blocks = [each.cells(cell_size(shots), BALLS) for each in shots]
     assert len({block.shape for block in blocks}) == 1
     high, wide, _ = blocks[-1].shape
@@ -136,7 +145,7 @@ def _colours(row: np.ndarray) -> bytes:
 
 
 def test_a_small_object_is_enlarged_and_a_large_one_reduced():
-    for full, size in ((1, 150), (12, LARGEST)):
+    for full, size in ((1, SMALLEST), (12, LARGEST)):
         sheet = object_cells(1, "ball", {"after": ball()}, views(full=full), photos(), BALLS)
         assert sheet.shape[0] % (size + 18 + GAP) == 0, full
 
