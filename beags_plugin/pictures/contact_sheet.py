@@ -18,7 +18,8 @@ from beags_plugin.pictures.masks import overlay
 from beags_plugin.pictures.object_cells import COLUMNS, Drawing, cell_size, object_shots
 from beags_plugin.rasterizers.rendering import surfel_inputs
 
-_WIDTH = 1920  # pixels of a sheet, if no object needs more; further cells go below
+_WIDTH = 1920  # pixels of a sheet without objects
+_TALLEST = 2.0  # most height of a photo's cell over its width
 
 
 def contact_sheet(
@@ -60,7 +61,7 @@ def contact_sheet(
     ]
     side = cell_size(shots)
     blocks = [finished([each.cells(side, drawing)]) for each in shots]
-    width = max([_WIDTH, *(block.shape[1] for (block,) in blocks)])
+    width = max((block.shape[1] for (block,) in blocks), default=_WIDTH)
     size = width // COLUMNS - GAP
     groups = [finished(_scene_cells(view, scene, drawing, background, size)) for view in chosen]
     return below([*wrapped(groups, width), *wrapped(blocks, width)])
@@ -76,7 +77,7 @@ def _scene_cells(
         inputs = surfel_inputs(scene.detach(), view.camera)
         render = as_bytes(drawing.rasterizer.rasterize(inputs, view.camera, settings, behind).color)
     high, wide = render.shape[:2]
-    scale = min(width / wide, width / high)
+    scale = min(width / wide, _TALLEST * width / high)
     size = max(1, round(scale * wide)), max(1, round(scale * high))
     pictures = []
     if view.image is not None:

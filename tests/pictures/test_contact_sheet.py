@@ -139,6 +139,17 @@ def test_lines_of_objects_of_different_size_end_together():
     assert np.array_equal(sheet[-high - GAP : -GAP, :wide], blocks[-1])
 
 
+def test_photos_are_as_wide_as_the_cells_of_objects():
+    held_out, (high, wide) = views(full=1), (96, 64)
+    upright = [replace(each, image=torch.rand(high, wide, 3), visible=None) for each in held_out]
+    upright = [replace(each, camera=replace(each.camera, width=wide, height=high)) for each in upright]
+    for shown in (held_out, upright):
+        sheet = contact_sheet(shown, photos(), ball(), {1: {"before": ball(), "after": ball(0.2)}}, {}, BALLS)
+        assert sheet.shape[1] == COLUMNS * (SMALLEST + GAP) + GAP
+        lines = sheet[18 : 18 + SMALLEST], sheet[-GAP - SMALLEST : -GAP]
+        assert all((line[:, -3 * GAP : -2 * GAP] < 255).any() for line in lines)
+
+
 def _colours(row: np.ndarray) -> bytes:
     """Return the pixels of a row without the white ones, which lie beside the photo."""
     return row[(row < 255).any(axis=1)].tobytes()
