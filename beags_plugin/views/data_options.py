@@ -95,8 +95,8 @@ class ViewOptions:
     begins: Suppress[bool] = False  # whether a base begins with seed points; the pipeline sets it
     focus: str = "auto"
     """Share of the steps that see close-ups of objects, at up to the size of the photos' files, and not whole photos.
-    off: none; auto: half, if masks cover less than 40 % of the photos' pixels and photos are scaled down; a run that
-    goes on with another sees some if that did."""
+    off: none; auto: half, if masks cover less than 40 % of the photos with objects and photos are scaled down; a run
+    that goes on with another sees some if that did."""
     photos: Literal["all", "objects"] = "all"
     """What training sees of the photos: all, or objects, their pixels alone before a random colour (turntables)."""
 

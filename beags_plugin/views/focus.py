@@ -15,6 +15,7 @@ import torch
 from rich.progress import track
 from torch import Tensor
 
+from beags_plugin.data.files import image_size
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE, count_ids
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
@@ -40,11 +41,12 @@ LEAST_SIDE = 32  # least pixels of a close-up's side; SSIM's window has 11
 class Aim:
     """Where the objects of a photo are.
 
-    boxes: of its close-ups. covered: share of its pixels that show objects. gain: magnification of objects in close-ups
-    over the whole photo at the size of the training. side: side of a square with the mean area of the objects' boxes,
-    pixels of the whole photo.
+    objects: their ids. boxes: of its close-ups. covered: share of its pixels that show objects. gain: magnification of
+    objects in close-ups over the whole photo at the size of the training. side: side of a square with the mean area of
+    the objects' boxes, pixels of the whole photo.
     """
 
+    objects: list[int]
     boxes: list[Box]
     covered: float
     gain: float = 1.0
@@ -68,7 +70,8 @@ def share_of(focus: str) -> float | None:
 class _Plan:
     """Which close-ups training sees.
 
-    share: of the steps. pixels: of a step. aims: by photo, of those with labels. covered, gain, side: means of these.
+    share: of the steps. pixels: of a step. aims: by photo, of those with labels. covered, gain, side: means of the aims
+    with objects.
     """
 
     share: float
@@ -80,8 +83,8 @@ class _Plan:
 
     def __str__(self) -> str:
         return (
-            f"Objects cover {self.covered:.1%} of the photos' pixels: {self.share:.0%} of the steps see close-ups of "
-            f"them, in which they are about {self.side * self.gain:.0f} pixels large, not {self.side:.0f}."
+            f"Objects cover {self.covered:.1%} of the photos that show them: {self.share:.0%} of the steps see "
+            f"close-ups of them, in which they are about {self.side * self.gain:.0f} pixels large, not {self.side:.0f}."
         )
 
 
@@ -132,17 +135,41 @@ def _planned(focus: str, files: PhotoFiles, labels: Callable[[int], Tensor | Non
         for photo in track(range(len(cameras)), "Looking for objects", transient=True)
         if (mask := labels(photo)) is not None
     }
+    if line := _lost(files, {each for aim in aims.values() for each in aim.objects}):
+        say(line)
     with_objects = [aim for aim in aims.values() if aim.boxes]
     if not with_objects:
         return None if share is None else "No mask of a training photo shows an object: focus is off."
-    covered = float(np.mean([aim.covered for aim in aims.values()]))
+    covered = float(np.mean([aim.covered for aim in with_objects]))
     gain = float(np.mean([aim.gain for aim in with_objects]))
     if share is None and gain < LEAST_GAIN:
         return None
     if share is None and covered >= MOST_COVERED:
-        return f"Objects cover {covered:.0%} of the photos' pixels: training sees whole photos alone (focus is off)."
+        return f"Objects cover {covered:.0%} of the photos that show them: training sees whole photos (focus is off)."
     side = float(np.mean([aim.side for aim in with_objects]))
     return _Plan(SHARE if share is None else share, pixels, aims, covered, gain, side)
+
+
+def _lost(files: PhotoFiles, found: set[int]) -> str | None:
+    """Return a sentence on objects in masks that no photo shows at the size of the training; None if there are none.
+
+    found: ids of the objects that photos show at that size. Masks are read again only if an object of ``classes`` is
+    missing.
+    """
+    missing = files.dataset.metadata["classes"].keys() - found - {BACKGROUND}
+    lost: set[int] = set()
+    for photo, file in enumerate(files.dataset.image_filenames):
+        if missing <= lost:
+            break
+        lost |= missing & set(np.unique(files.dataset.get_labels(photo, *image_size(file))).tolist())
+    if not lost:
+        return None
+    names = ", ".join(files.dataset.metadata["classes"][each] for each in sorted(lost))
+    return (
+        f"No photo shows {names} at the size of the training, so there will be no close-ups and no Gaussians of it: "
+        "it is too small (a lower --downscale-factor keeps more of the photos), or lies where removing the lens "
+        "distortion cuts the photos off."
+    )
 
 
 def _scaled_down(files: PhotoFiles) -> bool:
@@ -161,21 +188,21 @@ def aim_by(close_ups: CloseUps, files: PhotoFiles, labels: Sequence[Tensor]) -> 
 
 def _aim(files: PhotoFiles, photo: int, labels: np.ndarray, kept: float) -> Aim:
     covered = float(((labels != BACKGROUND) & (labels != IGNORE)).mean())
-    parts = list(_boxes(labels))
+    parts = dict(_boxes(labels))
     if not parts:
-        return Aim([], covered)
+        return Aim([], [], covered)
     camera = files.full_camera(photo)
     scale = np.array([camera.width / labels.shape[1], camera.height / labels.shape[0]] * 2)
     full = partial(_full_box, scale=scale, width=camera.width, height=camera.height)
-    boxes = [full(box) for box in _joined([_with_margin(box) for box in parts])]
+    boxes = [full(box) for box in _joined([_with_margin(box) for box in parts.values()])]
     shares = [np.prod(kept_size(box, len(boxes), kept)) / _area(box) for box in boxes]
     gain = float(np.sqrt(np.average(shares, weights=[_area(box) for box in boxes]) * scale[0] * scale[1]))
-    side = float(np.sqrt(np.mean([_area(box) for box in parts])))
-    return Aim(boxes, covered, gain, side)
+    side = float(np.sqrt(np.mean([_area(box) for box in parts.values()])))
+    return Aim(list(parts), boxes, covered, gain, side)
 
 
-def _boxes(labels: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the box of each object of labels [H, W], without small separate parts of its mask."""
+def _boxes(labels: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield id and box of each object of labels [H, W], without small separate parts of its mask."""
     for class_id in count_ids(labels)[0]:
         if class_id in (BACKGROUND, IGNORE):
             continue
@@ -184,7 +211,7 @@ def _boxes(labels: np.ndarray) -> Iterator[np.ndarray]:
         parts = parts[parts[:, cv2.CC_STAT_AREA] >= LEAST_PART * parts[:, cv2.CC_STAT_AREA].sum()]
         left_top = parts[:, [cv2.CC_STAT_LEFT, cv2.CC_STAT_TOP]]
         right_bottom = left_top + parts[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]
-        yield np.concatenate([left_top.min(axis=0), right_bottom.max(axis=0)]).astype(np.float64)
+        yield int(class_id), np.concatenate([left_top.min(axis=0), right_bottom.max(axis=0)]).astype(np.float64)
 
 
 def _with_margin(box: np.ndarray) -> np.ndarray:

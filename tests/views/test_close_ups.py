@@ -122,8 +122,8 @@ def test_off_is_as_without(tmp_path):
 
 @pytest.mark.parametrize(
     ("box", "downscale", "on", "line"),
-    [((40, 30, 100, 90), 4.0, True, "Objects cover 18.8% of the photos' pixels: 50% of the steps see close-ups"),
-     ((10, 10, 150, 110), 4.0, False, "Objects cover 73% of the photos' pixels: training sees whole photos alone"),
+    [((40, 30, 100, 90), 4.0, True, "Objects cover 18.8% of the photos that show them: 50% of the steps see close-ups"),
+     ((10, 10, 150, 110), 4.0, False, "Objects cover 73% of the photos that show them: training sees whole photos"),
      ((40, 30, 100, 90), 1.0, False, ""),  # photos have no more to show
      ((0, 0, 0, 0), 4.0, False, "")],
 )  # fmt: skip
@@ -131,6 +131,32 @@ def test_auto_looks_at_what_objects_cover_and_what_they_would_gain(tmp_path, cap
     write_objects(tmp_path, box)
     assert (focused(tmp_path, "auto", downscale).close_ups is not None) == on
     assert line in capsys.readouterr().out.replace("\n", " ")
+
+
+@pytest.mark.parametrize("side", [1, 2])
+@pytest.mark.parametrize("others", [(), ((40, 30, 80, 60),)])
+def test_an_object_smaller_than_a_pixel_is_named(tmp_path, capsys, side, others):
+    write_objects(tmp_path, *others, (23, 23, 23 + side, 23 + side))
+    assert (focused(tmp_path).close_ups is not None) == bool(others)
+    said = capsys.readouterr().out.replace("\n", " ")
+    small = len(others) + 1
+    assert f"No photo shows thing {small} at the size of the training" in said and "--downscale-factor" in said
+    assert f"thing {small}, thing" not in said and f", thing {small}" not in said
+
+
+def test_an_object_that_its_masks_do_not_hold_either_is_not_named(tmp_path, capsys):
+    write_objects(tmp_path, (40, 30, 80, 60), (0, 0, 0, 0))
+    assert focused(tmp_path).close_ups is not None
+    assert "No photo shows" not in capsys.readouterr().out.replace("\n", " ")
+
+
+def test_photos_without_objects_do_not_make_objects_small(tmp_path, capsys):
+    """A third of the photos shows an object that fills them."""
+    write_objects(tmp_path, (5, 5, 155, 115))
+    for name in ("v01", "v02", "v04", "v05", "v07"):
+        write_image(tmp_path / f"masks/{name}.png", np.zeros((120, 160), np.uint8))
+    assert focused(tmp_path).close_ups is None
+    assert "Objects cover 89% of the photos that show them" in capsys.readouterr().out.replace("\n", " ")
 
 
 def test_a_share_without_objects_is_off_and_says_so(tmp_path, capsys):
