@@ -16,6 +16,7 @@ from beags_benchmarks.experiments.scenes import TrialScene
 from beags_plugin.system.digests import code_digest, value_digest
 
 MODEL = "pipeline.model."
+FOCUS = "pipeline.datamanager.focus"
 OPTIONS = MODEL + "refiner_options"
 
 
@@ -116,9 +117,10 @@ def plan(
 
 
 def base_trial(experiment: Experiment, variant: Variant, scene: TrialScene, seed: int, code: str) -> Trial:
-    """Return the training of a variant's base, which depends on photos but not on masks."""
-    changes = {"pipeline.datamanager.focus": "off", **variant.base, MODEL + "refine_steps": 0}
-    return Trial(scene.photos or scene, experiment.preset, changes, seed, code)
+    """Return the training of a variant's base, which depends on masks only if it sees close-ups of objects."""
+    changes = {FOCUS: "off", **variant.base, MODEL + "refine_steps": 0}
+    photos = scene.photos if changes[FOCUS] == "off" else None
+    return Trial(photos or scene, experiment.preset, changes, seed, code)
 
 
 def steps_of(trial: Trial) -> int:

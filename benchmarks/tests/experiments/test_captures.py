@@ -30,13 +30,15 @@ from beags_benchmarks.experiments.engines import trial_folder
 from beags_benchmarks.experiments.experiment import FILES, Variant, load_experiment
 from beags_benchmarks.experiments.results import FIGURES, ResultRow
 from beags_benchmarks.experiments.scenes import TrialScene
-from beags_benchmarks.experiments.trials import MODEL, plan
+from beags_benchmarks.experiments.trials import FOCUS, MODEL, plan
 from beags_plugin.commands import cli
 from beags_plugin.masks.sources import salient
 from beags_plugin.masks.sources.prompts import read_prompts
 from beags_plugin.objects import make_masks
 from beags_plugin.plugin.presets import preset_config
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
+from beags_plugin.runs.checkpoint_file import read_checkpoint, saw_close_ups
+from beags_plugin.runs.layout import newest_checkpoint
 from beags_plugin.system.errors import UserError
 
 ROWS = FILES / "captures" / "rows.toml"
@@ -312,6 +314,41 @@ def test_rows_refine_as_the_presets_that_they_name():
     assert [name for name, variant in by_name.items() if variant.control is None and "loss" not in name] == [
         "assignment alone"
     ]
+
+
+def test_a_base_with_close_ups_takes_them_from_the_masks_and_one_without_is_of_the_photos():
+    photos = TrialScene("a", Path("/a"), 1.0, "1")
+    masked = TrialScene("a, picked", Path("/a"), 1.0, "2", options={"masks_path": "/masks"}, photos=photos)
+    runs = plan(load_experiment(str(ROWS.with_name("rows-focus.toml"))), [masked], {}, "")
+    assert [(run.trial.base.scene, run.trial.base.overrides[FOCUS]) for run in runs] == [
+        (photos, "off"),
+        (masked, "auto"),
+    ]
+
+
+@pytest.mark.slow("two bases are trained for it")
+def test_only_the_row_with_close_ups_has_seen_some(tmp_path, monkeypatch, capsys):
+    write_capture(tmp_path / "data", "fruit")
+    write_truth(tmp_path / "truth", "fruit")
+    small_experiment(monkeypatch, tmp_path)
+    rows = ROWS.with_name("rows-focus.toml")
+    options = CapturesOptions(
+        tmp_path / "data",
+        tmp_path / "truth",
+        rows=rows,
+        scenes=("fruit",),
+        quick=True,
+        size=40,
+        output=tmp_path / "out",
+    )
+    assert [row.failed for row in run_captures(options)] == [None, None]
+    seen = {}
+    for folder in (tmp_path / "out" / "trials").glob("fruit*-base-*"):
+        checkpoint = newest_checkpoint(folder / "run" / "nerfstudio_models")
+        focus = json.loads((folder / "trial.json").read_text())["overrides"][FOCUS]
+        seen[focus] = saw_close_ups(read_checkpoint(checkpoint))
+    assert seen == {"off": False, "auto": True}
+    assert "full size" in printed(capsys)
 
 
 def _of_masks(model) -> list:

@@ -20,6 +20,9 @@ _COLUMNS = (  # head, figure, digits, factor
     ("\nspill, %", "extracted_spill_after", 1, 100.0),
     ("rendered\nBIoU, %", "rendered_biou_after", 1, 100.0),
     ("\ncovered, %", "rendered_covered_after", 1, 100.0),
+    ("full size\nBIoU, %", "close_up_biou_after", 1, 100.0),
+    ("\nPSNR, dB", "close_up_psnr_after", 2, 1.0),
+    ("\nSSIM", "close_up_ssim_after", 3, 1.0),
     ("PSNR\ndB", "psnr_after", 2, 1.0),
     ("\nfitted, dB", "psnr_fit_after", 2, 1.0),
     ("\ncost, dB", COST, 2, 1.0),
@@ -39,6 +42,7 @@ def tables(rows: Sequence[ResultRow]) -> list[Table | str]:
     printed += [_table(scene, [row for row in rows if row.scene == scene]) for scene in scenes]
     printed.append("Worst object: the lowest extracted BIoU. Fitted: after the best colour fit of each photo.")
     printed.append("Covered: the share of an object's pixels that the rendered scene gives to something else.")
+    printed.append("Full size: the object's box in held-out photos at the size of their files.")
     printed.append("Cost: fitted PSNR of the row's control minus its own.")
     printed.append("CPU: of the whole trial, all threads; what making the masks takes is in neither.")
     if (protocol := protocol_of(rows)) is not None:
