@@ -73,6 +73,13 @@ _ALL = {
     "CPU seconds": SECONDS,
 }
 _COSTS = {"BIoU, %": BIOU, "spill, %": SPILL, "PSNR, dB": FITTED, "CPU seconds": SECONDS}
+_NEAR = {
+    "PSNR, dB": ("close_up_psnr_after", 2, 1.0),
+    "SSIM": ("close_up_ssim_after", 3, 1.0),
+    "BIoU, %": ("close_up_biou_after", 1, 100.0),
+    "whole photo, dB": FITTED,
+    "CPU seconds in all": ALL_SECONDS,
+}
 _OF_BASES = {"BIoU, %": BIOU, "BIoU in the scene, %": RENDERED, "PSNR, dB": FITTED, "CPU seconds in all": ALL_SECONDS}
 _REFINED = (
     "assignment alone",
@@ -188,6 +195,16 @@ TABLES: tuple[PageTable, ...] = (
             "base: with distortion",
         ),
     ),
+    *(
+        PageTable(
+            "notes/focus.md",
+            f"focus-{scene}",
+            name,
+            _of_scene("captures-focus", f"{scene}, picked", _NEAR),
+            ("whole photos", "close-ups too (beags-fast)"),
+        )
+        for scene, name in {"bear": "bear", "kitchen": "digger", "garden": "vase and table"}.items()
+    ),
     PageTable(
         "docs/comparison.md",
         "comparison-bear",
@@ -216,7 +233,8 @@ _METRICS = (
 _ROW = ("scene", "seed", "variant", "failed", "failures", "error_left", "lost_biou", "shown_after", "ssim_after",
         "rendered_iou_after", "rendered_biou_after", "rendered_covered_after", "extracted_spill_before",
         "extracted_spill_after", "psnr_fit_before", "psnr_fit_after", "removal_ssim_after", "removal_remains_after",
-        "steps", "cpu_seconds", "cpu_seconds total", "own_memory_mb", "peak_memory_mb", "objects")  # fmt: skip
+        "close_up_biou_after", "close_up_psnr_after", "close_up_ssim_after", "steps", "cpu_seconds",
+        "cpu_seconds total", "own_memory_mb", "peak_memory_mb", "objects")  # fmt: skip
 _OF_OBJECTS = "extracted_biou_after"
 
 
