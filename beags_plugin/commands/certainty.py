@@ -10,13 +10,17 @@ from typing import Any
 import numpy as np
 
 from beags_plugin.commands.answers import read_object
+from beags_plugin.commands.photo_coverage import Coverage
+from beags_plugin.commands.scene_setup import MadeScene
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.masks.separate_things import Things
 from beags_plugin.system.pasted import quoted
 
 SURE, FAIR = 0.9, 0.75  # Least agreement between the views for "sure" and "fairly sure".
 MANY = 0.1  # With a larger share of masks overruled as a whole, the demo is not sure.
+FAR, SOME = 0.2, 0.05  # With a larger share of masks that contradict the others by more than FAR, it is not "sure".
 NAMED = 6  # Photos named in a sentence.
+MOST = 12  # Files named in a command.
 SMALL = 150  # An object whose longer side has fewer pixels shows no printed text.
 PICTURES = 6  # Views in doubt.png.
 
@@ -35,13 +39,13 @@ class Certainty:
 
 
 def certainty(
-    run: Path, scene: Path, masks: Path | None = None, again: str = "beags demo --pick", apart: Path | None = None
+    run: Path, scene: MadeScene, again: str = "beags demo", apart: Path | None = None, seen: Coverage | None = None
 ) -> Certainty:
     """Judge a finished demo.
 
-    run: its run. scene: the folder of its photos, with poses.json if poses were computed. masks: the folder of made
-    masks, from which the user may delete some. again: the command with which the user picks the objects. apart: the
-    folder of the masks of separated things, with the report on their agreement.
+    run: its run. scene: of its photos, with poses.json if poses were computed. again: the demo's command without
+    --pick and --fresh. apart: the folder of the masks of separated things, with the report on their agreement. seen:
+    what the photos show.
     """
     lines, figures = [], {}
     prepared = read_object(run / "prepared/report.json")
@@ -50,51 +54,87 @@ def certainty(
     if agreement is not None:
         figures["agreement"] = {name: agreement[name] for name in ("agreement", "masks", "overruled", "doubtful")}
         lines.append(_of_masks(level, agreement))
+    elif scene.mended:
+        lines.append(
+            "How sure: not judged, since you repainted some of the network's masks, so all are taken as they are."
+        )
     things = None if agreement is None or "things" not in agreement else Things(**agreement["things"])
     if things is not None:
         figures["things"] = asdict(things)
         lines += [things.sentence()] if things.sentence() else []
-    poses = read_object(scene / "poses.json")
-    if {"photos", "registered"} <= set(poses):
-        without = int(poses["photos"]) - int(poses["registered"])
+    posed = read_object(scene.data / "poses.json")
+    if {"photos", "registered"} <= set(posed):
+        without = int(posed["photos"]) - int(posed["registered"])
         figures["photos without poses"] = without
         if without:
-            lines.append(f"{without} of {poses['photos']} photos have no pose and were left out.")
+            lines.append(_without_poses(without, int(posed["photos"]), posed.get("without_pose", [])))
+    if seen is not None:
+        figures |= seen.figures()
+        lines += seen.lines()
     if boxes := _boxes(run / "prepared/masks"):
         magnified = prepared.get("magnified", 1.0)
         width, height = (round(magnified * side) for side in np.median([box for _, box in boxes], axis=0))
         figures["object pixels"] = [width, height]
-        finer = ": for more detail, add --downscale 1" if max(width, height) < SMALL and magnified == 1 else ""
         subject = "The object has" if len({class_id for class_id, _ in boxes}) == 1 else "Objects have"
         where = "close-ups" if magnified > 1 else "photos"
-        lines.append(f"{subject} about {width} x {height} pixels in the {where} that training saw{finer}.")
-    if agreement is not None and (level != "sure" or (things is not None and things.found < things.asked)):
-        lines += _next(again, agreement, masks)
+        small = max(width, height) < SMALL and magnified == 1
+        end = ". For more detail train on the whole photos:" if small else "."
+        lines.append(f"{subject} about {width} x {height} pixels in the {where} that training saw{end}")
+        lines += [f"    {again} --downscale 1 --fresh"] if small else []
+    if agreement is not None:
+        lines += _next(again, agreement, scene)
     return Certainty(level, lines, figures)
 
 
 def _level(agreement: dict[str, Any]) -> str:
-    overruled = len(agreement["overruled"]) / max(agreement["masks"], 1)
+    masks = max(agreement["masks"], 1)
+    overruled, far = len(agreement["overruled"]) / masks, len(_far(agreement)) / masks
     if agreement["agreement"] < FAIR or overruled > MANY:
         return "not sure"
-    return "sure" if agreement["agreement"] >= SURE and not overruled else "fairly sure"
+    return "sure" if agreement["agreement"] >= SURE and not overruled and far <= SOME else "fairly sure"
+
+
+def _far(agreement: dict[str, Any]) -> list[str]:
+    """Return the views whose masks contradict the others by more than ``FAR``."""
+    return [each["view"] for each in agreement["views"] if (each["contradicts"] or 0.0) > FAR]
 
 
 def _of_masks(level: str, agreement: dict[str, Any]) -> str:
     line = f"How sure: {level}. The views agree on {100 * agreement['agreement']:.0f} % of what they call the object"
+    masks, far = agreement["masks"], len(_far(agreement))
     if agreement["overruled"]:
-        line += f"; {len(agreement['overruled'])} of {agreement['masks']} masks were overruled as a whole"
+        line += f"; {len(agreement['overruled'])} of {masks} masks were overruled as a whole"
+    if far > SOME * masks:
+        line += f"; {far} of {masks} contradict the others on more than {100 * FAR:.0f} %"
     return f"{line}; {100 * agreement['doubtful']:.1f} % of all pixels are in doubt and were left out."
 
 
-def _next(again: str, agreement: dict[str, Any], masks: Path | None) -> list[str]:
-    lines = ["If the object is not what you meant, pick it by a few clicks:", f"    {again} --fresh"]
-    if masks is not None and agreement["overruled"]:
-        names = [quoted(masks / f"{name}.png") for name in agreement["overruled"][:NAMED]]
+def _without_poses(without: int, photos: int, names: list[str]) -> str:
+    named = ", ".join(names[:NAMED]) + (" ..." if len(names) > NAMED else "")
+    verb = "has" if without == 1 else "have"
+    end = "was left out" if without == 1 else "were left out"
+    return f"{without} of {photos} photos {verb} no pose and {end}{f' ({named})' if named else ''}."
+
+
+def _next(again: str, agreement: dict[str, Any], scene: MadeScene) -> list[str]:
+    """Return what the user can do, with commands to paste."""
+    lines = [
+        "Only agreement is judged. If the object is not what you meant, pick it by a few clicks:",
+        f"    {again} --pick --fresh",
+    ]
+    if (masks := scene.made_masks) is not None and agreement["overruled"]:
+        names = [quoted(masks / f"{name}.png") for name in agreement["overruled"][:MOST]]
         more = len(agreement["overruled"]) - len(names)
         others = f" ({more} more)" if more else ""
-        lines += [f"Or delete the masks that contradict the others{others}, and run it again:",
-                  f"    rm {' '.join(names)}"]  # fmt: skip
+        lines += [f"Or delete the masks that contradict the others{others}, and train again:",
+                  f"    rm {' '.join(names)}", f"    {again} --fresh"]  # fmt: skip
+    if misplaced := agreement.get("misplaced"):
+        names = ", ".join(misplaced[:MOST]) + (" ..." if len(misplaced) > MOST else "")
+        photos, masks = ("photo seems", "its mask fits") if len(misplaced) == 1 else ("photos seem", "their masks fit")
+        lines.append(
+            f"{len(misplaced)} {photos} to have a wrong pose ({names}): {masks} the object only when shifted. It may "
+            "be sharper without them: take them out of your photos, and run the demo again with another --output."
+        )
     return lines
 
 

@@ -28,6 +28,7 @@ from beags_plugin.system.progress import progress_bar, timed
 from beags_plugin.system.whole_files import write_text_atomically
 
 if TYPE_CHECKING:
+    from beags_plugin.commands.certainty import Certainty
     from beags_plugin.commands.scene_setup import MadeScene
     from beags_plugin.core.surfels import Surfels
     from beags_plugin.objects.evaluate import EvaluatedRun
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from beags_plugin.plugin.options.model_options import BeagsModelConfig
 
 BEFORE = ("sample", "poses", "poses and masks", "base training")  # Stages before the training that is measured.
+EXCHANGED = ("inverted", "swapped ids")  # Kinds of issues with whole masks that contradict the others.
 PRESET, PRESET_OF_PHOTOS = "beags-tiny", "beags-fast"
 SIZE, DOWNSCALE = (640, 480), 2.5
 """Width and height of the generated photos, and their downscale factor in training."""
@@ -90,7 +92,7 @@ def run_demo(
         names = names_of(data, objects)
         scene = _trained_on_base(
             scene, output, request, fresh, seconds, {"pick": True},
-            lambda base: picked_scene(scene, base, names, fresh, again),
+            lambda base: picked_scene(scene, base, names, fresh, f"{again} --pick"),
         )  # fmt: skip
     elif objects > 1 and not scene.turned:
         scene = _trained_on_base(
@@ -101,9 +103,16 @@ def run_demo(
         if objects > 1:
             CONSOLE.print("As they turned before a room that stands, the things stay one object.")
         _trained_by_masks(scene, output, request, fresh, GENERATED if data is None else ())
-    measure(output / "run", output, seconds, scene, again)
+    sure = measure(output / "run", output, seconds, scene, again)
     if pick:
-        CONSOLE.print(f"If the objects are not what you meant, pick them again on the same base:\n    {again} --fresh")
+        CONSOLE.print(
+            f"If the objects are not what you meant, pick them again on the same base:\n    {again} --pick --fresh"
+        )
+    if strict and sure.level == "not sure":
+        raise UserError(
+            f"the masks contradict each other too much (see above); the result is in {output} all the same. Do what "
+            "the lines above say, or leave --strict out."
+        )
 
 
 def _trained_by_masks(
@@ -174,11 +183,11 @@ def _check_objects(data: Path | None, pick: bool, objects: int, strict: bool) ->
 
 
 def _again(data: Path | None, output: Path | None, preset: str | None, downscale: float | None, objects: int) -> str:
-    """Return the command that continues this demo by picking."""
+    """Return the command of this demo, without --pick and --fresh."""
     words = ["beags", "demo", *([] if data is None else ["--data", str(data)])]
     for name, value in (("output", output), ("preset", preset), ("downscale", downscale)):
         words += [] if value is None else [f"--{name}", str(value)]
-    return command([*words, *([] if objects == 1 else ["--objects", str(objects)]), "--pick"])
+    return command([*words, *([] if objects == 1 else ["--objects", str(objects)])])
 
 
 def check_contradictions(scene: MadeScene, output: Path) -> None:
@@ -190,14 +199,16 @@ def check_contradictions(scene: MadeScene, output: Path) -> None:
 
     masks = None if scene.labels is None else (scene.labels / "masks").absolute()
     report = check_scene(options_beside(None, scene.data, masks_path=masks))
-    views = list(dict.fromkeys(one.view for one in report.contradictions))
+    views = [one.view for one in report.contradictions]
+    views += [view for issue in report.issues if issue.kind in EXCHANGED for view in issue.views]
+    views = list(dict.fromkeys(views))
     if views:
-        picture = write_contradictions(report, output)[0]
+        written = write_contradictions(report, output)
+        see = f"; see {written[0]}" if written else ""
         named = ", ".join(views[:6]) + (f" and {len(views) - 6} more" if len(views) > 6 else "")
-        raise UserError(
-            f"{len(views)} masks contradict the others ({named}; see {picture}): correct or delete them, or leave "
-            "--strict out."
-        )
+        which = f"the mask of {views[0]} contradicts" if len(views) == 1 else f"{len(views)} masks contradict"
+        raise UserError(f"{which} the others ({named}{see}): correct or delete them, or leave --strict out.")
+    CONSOLE.print(report.compared or "The masks are too few, or hold no object, so they were not compared.")
 
 
 def check_preset(preset: str) -> None:
@@ -218,12 +229,17 @@ def inputs_digest(scene: MadeScene, output: Path, preset: str) -> str:
     return value_digest([*scene.digests(output), code_digest(), *texts])
 
 
-def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene, again: str = "") -> None:
+def measure(
+    run: Path, output: Path, seconds: dict[str, float], scene: MadeScene, again: str = "beags demo"
+) -> Certainty:
     """Compare assignment alone with refinement, extract every object, write summary.json and the pictures.
 
-    again: the command with which the user picks the objects.
+    Returns how sure the result is, which it also prints.
+
+    again: the demo's command without --pick and --fresh.
     """
     from beags_plugin.commands.certainty import certainty, write_doubt
+    from beags_plugin.commands.photo_coverage import coverage
     from beags_plugin.evaluation.table import render_run, summary_json
     from beags_plugin.objects.evaluate import EvaluatedRun
     from beags_plugin.objects.extract import extract_objects
@@ -240,8 +256,9 @@ def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene
     with timed(seconds, "picture"), progress_bar("Making the picture") as progress:
         views = evaluated.views
         refined, drawing = evaluated.stages["after"], Drawing(evaluated.rasterizer, evaluated.settings)
+        objects = _alone(evaluated, extracted)
         sheet = contact_sheet(
-            views, views.cameras("train"), refined.surfels(), _alone(evaluated, extracted), evaluated.classes, drawing,
+            views, views.cameras("train"), refined.surfels(), objects, evaluated.classes, drawing,
             background=views.background, progress=progress,
         )  # fmt: skip
         write_picture(picture, sheet)
@@ -250,7 +267,7 @@ def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene
     stages = {**made, **{name: taken for name, taken in training["seconds"].items() if name not in made}, **seconds}
     memory = training["peak_memory_mb"]
     apart = scene.labels if scene.labels == output / APART else None
-    sure = certainty(run, scene.data, scene.made_masks, again, apart)
+    sure = certainty(run, scene, again, apart, coverage(evaluated, objects))
     judged = {"level": sure.level, "sentences": sure.lines, **sure.figures}
     summary = {**summary_json(metrics, stages, memory), "certainty": judged}
     write_text_atomically(json.dumps(summary, indent=2), output / "summary.json")
@@ -264,6 +281,7 @@ def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene
     CONSOLE.print(f"look:    beags view {quoted(run)}")
     for line in sure.lines:
         CONSOLE.print(line)
+    return sure
 
 
 def _alone(run: EvaluatedRun, written: Sequence[Extracted]) -> dict[int, dict[str, Surfels]]:

@@ -103,15 +103,30 @@ def made_masks(scene: Path, folder: Path, name: str, chosen: ChosenSource) -> Pa
         write_text_atomically(json.dumps({"masks": UNFINISHED}), folder / MADE)
         for line in make_masks(config, chosen.source(name), output=folder, overwrite=True):
             CONSOLE.print(line)
-        write_text_atomically(json.dumps({"photos": photos, "masks": folder_digest(masks)}), folder / MADE)
+        made = {"photos": photos, "masks": folder_digest(masks), "files": _files(masks)}
+        write_text_atomically(json.dumps(made), folder / MADE)
     CONSOLE.print(f"Look at {folder / 'made.png'}. If you mend masks in {masks}, the next demo uses them.")
     return None if folder == scene else folder
 
 
 def as_made(folder: Path) -> bool:
-    """Return whether the masks in a folder are still as the network made them."""
-    made = read_object(folder / MADE).get("masks")
-    return made is not None and made != UNFINISHED and made == folder_digest(folder / "masks")
+    """Return whether each mask in a folder is as the network made it; the user may have deleted others."""
+    made = read_object(folder / MADE)
+    if made.get("masks") in (None, UNFINISHED):
+        return False
+    if "files" not in made:  # Earlier versions wrote no digests of single masks.
+        return made["masks"] == folder_digest(folder / "masks")
+    return _files(folder / "masks").items() <= made["files"].items()
+
+
+def mended(folder: Path) -> bool:
+    """Return whether a network made masks in a folder, and the user changed or added some."""
+    return (folder / MADE).exists() and not as_made(folder)
+
+
+def _files(masks: Path) -> dict[str, str]:
+    """Return the digest of each mask by its name."""
+    return {str(path.relative_to(masks)): content_digest([path]) for path in sorted(masks.rglob("*.png"))}
 
 
 def _digest(photos: Sequence[Path]) -> str:

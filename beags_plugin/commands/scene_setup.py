@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from beags_plugin.commands.answers import CONSOLE
-from beags_plugin.commands.made_masks import MADE, SALIENT, ChosenSource, as_made, check_source, made_masks
+from beags_plugin.commands.made_masks import MADE, SALIENT, ChosenSource, as_made, check_source, made_masks, mended
 from beags_plugin.commands.process import find_poses
 from beags_plugin.data.layout import fitting_layouts, read_dataset
 from beags_plugin.masks.sources.base import NothingFound
@@ -43,9 +43,14 @@ class MadeScene:
 
     @property
     def made_masks(self) -> Path | None:
-        """Return the folder of masks that a network made and nobody mended; None for others."""
+        """Return the folder of masks that a network made and nobody repainted; None for others."""
         folder = self.labels or self.data
         return folder / "masks" if as_made(folder) else None
+
+    @property
+    def mended(self) -> bool:
+        """Return whether a network made masks and the user repainted some, so that all are taken as they are."""
+        return mended(self.labels or self.data)
 
     def options(self) -> list[str]:
         """Return the options of ``beags-data`` that name its masks."""

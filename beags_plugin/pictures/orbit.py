@@ -16,6 +16,7 @@ from beags_plugin.rasterizers.interface import RasterSettings
 _FIELD_OF_VIEW = math.radians(35.0)
 _MARGIN = 1.06  # factor on the box in the widest picture of the turn, as discs reach beyond the box
 _STEP = 5  # degrees between candidate sides
+_FACING = 60.0  # most degrees between a side and a photo that shows it
 _NEAR, _FAR = 0.02, 100.0  # depth range, in distances to the centre
 
 
@@ -94,13 +95,27 @@ def least_shown(stand: OrbitFrame, cameras: Sequence[Camera], elevation: float) 
 
     cameras: the photos' cameras. Without any that has the centre in its picture, the azimuth is 180.
     """
+    nearest = _nearest(stand, cameras, elevation)
+    return 180.0 if nearest is None else float(_STEP * int(nearest.argmin()))
+
+
+def unshown(stand: OrbitFrame, cameras: Sequence[Camera], elevation: float) -> int:
+    """Return over how many of the 360 degrees about the up axis no photo shows the object from within 60 degrees.
+
+    cameras, elevation: as in ``least_shown``.
+    """
+    nearest = _nearest(stand, cameras, elevation)
+    return 360 if nearest is None else _STEP * int((nearest < math.cos(math.radians(_FACING))).sum())
+
+
+def _nearest(stand: OrbitFrame, cameras: Sequence[Camera], elevation: float) -> Tensor | None:
+    """Return the cosine of the angle of each side, ``_STEP`` degrees apart, to the nearest camera; None without any."""
     showing = [camera for camera in cameras if shows(camera, stand.center)]
     if not showing:
-        return 180.0
+        return None
     aways = torch.stack([camera.center for camera in showing]).double() - stand.center
     sides = torch.stack([side(stand, azimuth, elevation) for azimuth in range(0, 360, _STEP)])
-    nearest = (sides @ torch.nn.functional.normalize(aways, dim=1).T).amax(dim=1)
-    return float(_STEP * int(nearest.argmin()))
+    return (sides @ torch.nn.functional.normalize(aways, dim=1).T).amax(dim=1)
 
 
 def view_from(stand: OrbitFrame, away: Tensor, pixels: int, room: float = 1.0) -> Camera:

@@ -73,6 +73,11 @@ class HeldOutViews(Sequence[EvalView]):
         cameras = (self.manager.train_dataset if split == "train" else self.manager.eval_dataset).cameras
         return [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
 
+    @property
+    def names(self) -> list[str]:
+        """Return the names of the views; no photo is read."""
+        return [view.name for view in self._views]
+
     def _view(self, index: int) -> EvalView:
         view = self._views[index]
         truth = self._metadata["ground_truth"] or _NO_TRUTH

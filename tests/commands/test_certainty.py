@@ -9,26 +9,34 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from ball_scenes import write_balls
 from data_folders import write_image
 from run_folders import write_scene
 
 from beags_plugin.commands import demo, demo_training
-from beags_plugin.commands.certainty import certainty, write_doubt
+from beags_plugin.commands.certainty import Certainty, certainty, write_doubt
 from beags_plugin.commands.made_masks import MADE, as_made
+from beags_plugin.commands.photo_coverage import Coverage
 from beags_plugin.commands.scene_setup import MadeScene
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import write_mask
 from beags_plugin.masks.check.contradictions import Contradiction
+from beags_plugin.masks.check.issues import Issue
 from beags_plugin.objects import check_masks
-from beags_plugin.system.digests import folder_digest
+from beags_plugin.system.digests import content_digest, folder_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.views.close_ups import CLOSE_UPS
 
 
-def write_run(folder: Path, agreement: float | None, overruled: list[str]) -> Path:
-    """Write what certainty reads of a run: its report, and masks of an object of 40 x 20 pixels."""
+def write_run(folder: Path, agreement: float | None, overruled: list[str], far: int = 0, **more: object) -> Path:
+    """Write what certainty reads of a run: its report, and masks of an object of 40 x 20 pixels.
+
+    far: number of the 20 views that contradict the others by 30 %.
+    """
     (folder / "prepared/masks").mkdir(parents=True)
-    report = {"agreement": agreement, "masks": 20, "overruled": overruled, "doubtful": 0.004, "views": []}
+    views = [{"view": f"v{view}", "contradicts": 0.3 if view < far else 0.05} for view in range(20)]
+    views.append({"view": "none", "contradicts": None})
+    report = {"agreement": agreement, "masks": 20, "overruled": overruled, "doubtful": 0.004, "views": views, **more}
     (folder / "prepared/report.json").write_text(json.dumps({} if agreement is None else {"agreement": report}))
     mask = np.zeros((60, 80), np.uint16)
     mask[10:30, 5:45] = 1
@@ -43,13 +51,42 @@ def write_run(folder: Path, agreement: float | None, overruled: list[str]) -> Pa
      (0.95, ["a", "b", "c"], "not sure"), (None, [], "not judged")],
 )  # fmt: skip
 def test_the_words_follow_from_what_the_masks_agree_on(tmp_path, agreement, overruled, level):
-    found = certainty(write_run(tmp_path / "run", agreement, overruled), tmp_path)
+    found = certainty(write_run(tmp_path / "run", agreement, overruled), MadeScene(tmp_path))
     assert found.level == level
     said = " ".join(found.lines)
     assert (f"How sure: {level}" in said) == (agreement is not None)
-    assert ("beags demo --pick --fresh" in said) == (level in ("fairly sure", "not sure"))
-    assert "40 x 20 pixels" in said and "--downscale 1" in said
+    assert ("    beags demo --pick --fresh" in found.lines) == (agreement is not None), (
+        "a network may mark another thing"
+    )
+    assert "40 x 20 pixels" in said and "    beags demo --downscale 1 --fresh" in found.lines
     assert found.figures["object pixels"] == [40, 20]
+
+
+@pytest.mark.parametrize(("far", "level"), [(1, "sure"), (2, "fairly sure"), (8, "fairly sure")])
+def test_a_group_of_views_that_contradicts_the_others_is_said_although_most_agree(tmp_path, far, level):
+    found = certainty(write_run(tmp_path / "run", 0.93, [], far), MadeScene(tmp_path))
+    assert found.level == level
+    assert (f"{far} of 20 contradict the others on more than 20 %" in found.lines[0]) == (level != "sure")
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [(["a"], "1 photo seems to have a wrong pose (a): its mask fits"),
+     (["a", "b"], "2 photos seem to have a wrong pose (a, b): their masks fit")],
+)  # fmt: skip
+def test_photos_with_wrong_poses_are_named(tmp_path, names, said):
+    lines = certainty(write_run(tmp_path / "run", 0.95, [], misplaced=names), MadeScene(tmp_path)).lines
+    assert said in lines[-1]
+
+
+def test_what_photos_do_not_show_is_said_and_stored(tmp_path):
+    seen = Coverage(5, ["v1", "v2"], {"cup": 120, "plate": 30})
+    found = certainty(write_run(tmp_path / "run", None, []), MadeScene(tmp_path), seen=seen)
+    said = " ".join(found.lines)
+    assert "Of the 5 photos kept out of training, a veil hides the object in 2 (v1, v2)" in said
+    assert "No photo shows cup over about 120 of the 360 degrees" in said and "plate" not in said
+    assert found.figures["veiled"] == ["v1", "v2"] and found.figures["degrees without photos"]["plate"] == 30
+    assert Coverage(5, [], {"cup": 0}).lines() == []
 
 
 def test_the_size_is_that_in_close_ups_where_training_saw_some(tmp_path):
@@ -57,7 +94,7 @@ def test_the_size_is_that_in_close_ups_where_training_saw_some(tmp_path):
     (run / "prepared/report.json").write_text(json.dumps({"magnified": 4.5}))
     (run / "prepared/masks" / CLOSE_UPS).mkdir()
     shutil.copy(run / "prepared/masks/a.png", run / "prepared/masks" / CLOSE_UPS / "a-1.png")
-    found = certainty(run, tmp_path)
+    found = certainty(run, MadeScene(tmp_path))
     assert found.figures["object pixels"] == [180, 90] and "--downscale" not in " ".join(found.lines)
 
 
@@ -66,18 +103,28 @@ def test_the_size_is_that_of_one_object_where_there_are_several(tmp_path):
     mask = np.zeros((60, 80), np.uint16)
     mask[:20, :10], mask[40:, 50:60] = 1, 2
     write_mask(run / "prepared/masks/a.png", mask)
-    assert "Objects have about 10 x 20 pixels" in " ".join(certainty(run, tmp_path).lines)
+    assert "Objects have about 10 x 20 pixels" in " ".join(certainty(run, MadeScene(tmp_path)).lines)
 
 
-def test_photos_without_poses_and_masks_to_delete_are_named(tmp_path):
-    (tmp_path / "poses.json").write_text(json.dumps({"photos": 30, "registered": 26}))
-    overruled = [f"v {index}" for index in range(8)]
-    lines = certainty(write_run(tmp_path / "run", 0.6, overruled), tmp_path, tmp_path / "masks").lines
-    assert "4 of 30 photos have no pose and were left out." in lines
-    assert "8 of 20 masks were overruled" in " ".join(lines)
-    (command,) = [line for line in lines if line.startswith("    rm ")]
-    assert command.count(".png'") == 6 and f"'{tmp_path}/masks/v 0.png'" in command
-    assert any("(2 more)" in line for line in lines)
+def test_photos_without_poses_are_named(tmp_path):
+    poses = {"photos": 30, "registered": 26, "without_pose": ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]}
+    (tmp_path / "poses.json").write_text(json.dumps(poses))
+    run = write_run(tmp_path / "run", None, [])
+    lines = certainty(run, MadeScene(tmp_path)).lines
+    assert "4 of 30 photos have no pose and were left out (a.jpg, b.jpg, c.jpg, d.jpg)." in lines
+    poses |= {"registered": 29, "without_pose": ["a.jpg"]}
+    (tmp_path / "poses.json").write_text(json.dumps(poses))
+    assert "1 of 30 photos has no pose and was left out (a.jpg)." in certainty(run, MadeScene(tmp_path)).lines
+
+
+def test_masks_to_delete_are_named_with_the_command_that_trains_again(tmp_path):
+    data, overruled = write_scene(tmp_path / "data"), [f"v {index}" for index in range(14)]
+    (data / MADE).write_text(json.dumps({"photos": "", "masks": folder_digest(data / "masks")}))
+    lines = certainty(write_run(tmp_path / "run", 0.6, overruled), MadeScene(data), "beags demo --data x").lines
+    assert "14 of 20 masks were overruled" in lines[0]
+    (number,) = [number for number, line in enumerate(lines) if line.startswith("    rm ")]
+    assert lines[number].count(".png'") == 12 and f"'{data}/masks/v 0.png'" in lines[number]
+    assert "(2 more)" in lines[number - 1] and lines[number + 1] == "    beags demo --data x --fresh"
 
 
 @pytest.mark.parametrize(("found", "said"), [(3, False), (2, True)])
@@ -87,10 +134,10 @@ def test_things_told_apart_are_judged_by_their_own_report_and_fewer_are_said(tmp
     agreement = {"agreement": 0.97, "masks": 20, "overruled": [], "doubtful": 0.004, "views": []}
     (apart / "report.json").write_text(json.dumps({**agreement, "things": {"asked": 3, "found": found, "more": 0}}))
     (apart / "doubt.png").write_bytes(b"drawn")
-    judged = certainty(run, tmp_path, None, "beags demo --data x --pick", apart)
+    judged = certainty(run, MadeScene(tmp_path), "beags demo --data x", apart)
     assert judged.level == "sure" and judged.figures["things"]["found"] == found
     sentence = "Only 2 separate things were found, not 3: click on things that touch, or that most masks lack."
-    assert (sentence in judged.lines) is said and ("    beags demo --data x --pick --fresh" in judged.lines) is said
+    assert (sentence in judged.lines) is said and "    beags demo --data x --pick --fresh" in judged.lines
     assert write_doubt(run, tmp_path / "doubt.png", apart) and (tmp_path / "doubt.png").read_bytes() == b"drawn"
 
 
@@ -106,22 +153,59 @@ def test_masks_that_a_network_made_are_made_to_agree_and_those_that_were_mended_
 
     assert not agrees()  # the user's own
     (data / MADE).write_text(json.dumps({"photos": "", "masks": folder_digest(data / "masks")}))
-    assert as_made(data) and agrees() and not agrees("objects")
+    assert as_made(data) and agrees() and not agrees("objects")  # as earlier versions wrote it
+    files = {path.name: content_digest([path]) for path in (data / "masks").glob("*.png")}
+    (data / MADE).write_text(json.dumps({"photos": "", "masks": "of all", "files": files}))
+    (data / "masks/v02.png").unlink()
+    assert agrees() and not scene.mended, "without a mask that the user deleted the others still have shared errors"
     write_image(data / "masks/v03.png", np.zeros((12, 16), np.uint8))
-    assert not agrees()
+    assert not agrees() and scene.mended
+    assert "How sure: not judged, since you repainted" in certainty(write_run(tmp_path / "r", None, []), scene).lines[0]
 
 
-def test_strict_stops_before_training_where_masks_contradict(tmp_path, monkeypatch):
-    data = write_scene(tmp_path / "data")
-    contradiction = Contradiction("v03", 1, 5, 0, 10, "points")
-    report = SimpleNamespace(contradictions=[contradiction])
-    monkeypatch.setattr(check_masks, "check_scene", lambda _: report)
+@pytest.fixture
+def stand(tmp_path, monkeypatch):
+    """A demo with --strict on a scene whose check reports what the test says, and whose training ends in no time."""
+    stand = SimpleNamespace(data=write_scene(tmp_path / "data"), output=tmp_path / "out", level="sure")
+    stand.report = SimpleNamespace(contradictions=[], issues=[], compared="Views were compared at 7 points")
+    monkeypatch.setattr(check_masks, "check_scene", lambda _: stand.report)
     monkeypatch.setattr(check_masks, "write_contradictions", lambda _, output: [output / "contradicted.png"])
-    with pytest.raises(UserError, match=r"1 masks contradict the others \(v03; see .*contradicted.png\)"):
-        demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, False, True)
-    assert not (tmp_path / "out/run").exists()
     monkeypatch.setattr(demo, "train_once", lambda *_, **__: None)
-    monkeypatch.setattr(demo, "measure", lambda *_, **__: None)
-    demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, False)
-    report.contradictions.clear()
-    demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, False, True)
+    monkeypatch.setattr(demo, "measure", lambda *_, **__: Certainty(stand.level, []))
+    stand.run = lambda strict=True: demo.run_demo(stand.data, stand.output, "beags-tiny", None, 0, False, strict)
+    return stand
+
+
+def test_strict_stops_before_training_where_masks_contradict(stand, capsys):
+    stand.run()
+    assert "Views were compared at 7 points" in capsys.readouterr().out
+    stand.report.contradictions = [Contradiction("v03", 1, 5, 0, 10, "points")]
+    with pytest.raises(UserError, match=r"the mask of v03 contradicts the others \(v03; see .*contradicted.png\)"):
+        stand.run()
+    stand.run(strict=False)
+
+
+@pytest.mark.parametrize("kind", ["inverted", "swapped ids"])
+def test_strict_stops_at_whole_masks_that_contradict(stand, kind, monkeypatch):
+    monkeypatch.setattr(check_masks, "write_contradictions", lambda *_: [])
+    stand.report.issues = [
+        Issue("warning", kind, "message", "cost", ("v01", "v02")),
+        Issue("note", "few", "", "", ("v05",)),
+    ]
+    with pytest.raises(UserError, match=r"2 masks contradict the others \(v01, v02\): correct"):
+        stand.run()
+
+
+def test_strict_finds_inverted_masks_without_a_colmap_model(tmp_path, monkeypatch):
+    data = write_balls(tmp_path / "data", lambda view, ids: np.uint8((ids == 1) != (view in (5, 6))))
+    (data / "classes.json").write_text('{"1": "left"}')
+    monkeypatch.setattr(demo, "train_once", lambda *_, **__: pytest.fail("it must not train"))
+    with pytest.raises(UserError, match=r"2 masks contradict the others \(v05, v06"):
+        demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, False, True)
+
+
+def test_strict_fails_at_the_end_where_the_result_is_not_sure(stand):
+    stand.level = "not sure"
+    with pytest.raises(UserError, match="the masks contradict each other too much"):
+        stand.run()
+    stand.run(strict=False)
