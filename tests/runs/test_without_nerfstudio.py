@@ -16,6 +16,7 @@ pytest.importorskip("nerfstudio")
 
 from run_folders import write_prepared, write_scene, write_trained
 
+from beags_plugin.commands.cli import main
 from beags_plugin.plugin.options.saved_config import load_run_config, open_for_training
 from beags_plugin.runs.relocation import open_run
 from beags_plugin.runs.run_config import read_run_config
@@ -109,3 +110,12 @@ def test_a_run_with_options_that_are_gone_still_opens(config, tmp_path):
     assert read_run_config(config).model_config.near == load_run_config(config).model_config.near
     made = write_run(open_run(config), tmp_path / "part", {}, 3)
     assert "pyramid" not in made.read_text() and load_run_config(made).model_config.near == 0.01
+
+
+def test_a_run_centred_as_no_longer_possible_is_refused_in_one_sentence(config, capsys):
+    text = config.read_text()
+    assert "center_method: none" in text
+    config.write_text(text.replace("center_method: none", "center_method: focus"))
+    with pytest.raises(SystemExit):
+        main(["eval", "--load-config", str(config)])
+    assert "center_method is 'focus', which is gone: train again, or use the version" in capsys.readouterr().out
