@@ -207,5 +207,11 @@ def test_nothing_imports_the_distributions_beside_it():
         assert not names & {"beags_benchmarks", "beags_baselines"}, f"beags_plugin/{module}.py"
 
 
+def test_tests_are_collected_without_the_distributions_beside_it():
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        named = re.search(r"^(?:from|import) (beags_(?:benchmarks|baselines))", text := path.read_text(), re.MULTILINE)
+        assert named is None or f'pytest.importorskip("{named[1]}"' in text, path
+
+
 def test_the_package_itself_imports_nothing():
     assert not loaded_by("import beags_plugin") & {"torch", "numpy", "nerfstudio"}

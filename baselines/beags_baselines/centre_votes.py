@@ -18,9 +18,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from beags_baselines.pixels import pixels_under, project_directions
 from beags_plugin.assignment.sparse_sums import TorchSparseSums, largest_in_rows
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.lifting import pixels_under, project_directions
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE

@@ -20,6 +20,7 @@ import torch
 
 from beags_baselines import identity_codes
 from beags_baselines.learned_codes import CodeTraining
+from beags_baselines.ranked_labels import ranked_labels
 from beags_plugin.core.membership import Membership
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.losses.base import LossInputs
@@ -60,7 +61,7 @@ class IdentityTraining(CodeTraining):
     def terms(self, inputs: LossInputs, step: int, base: Callable[[], Terms]) -> Terms:
         terms, learned = base(), self.learned
         if inputs.labels is not None and bool((inputs.labels != IGNORE).any()):  # a view without a mask is all IGNORE
-            labels = self.ranks.ranked_labels(inputs.labels)
+            labels = ranked_labels(self.ranks, inputs.labels)
             rendered = learned.rendered(inputs.surfels, inputs.camera)
             terms["identities"] = identity_codes.pixel_loss(learned.classifier, rendered, labels)
         if step % identity_codes.INTERVAL == 0:

@@ -21,6 +21,7 @@ from torch import Tensor
 from beags_baselines import identity_codes
 from beags_baselines.learned_codes import CodeTraining
 from beags_baselines.object_codebook import code_entropy, members_by_softmax
+from beags_baselines.ranked_labels import ranked_labels
 from beags_plugin.core.membership import Membership
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.losses.base import LossInputs
@@ -83,7 +84,7 @@ class IlgsTraining(CodeTraining):
         terms = base()
         if inputs.labels is None or self.options.weight == 0:
             return terms
-        labels = self.ranks.ranked_labels(inputs.labels).flatten()
+        labels = ranked_labels(self.ranks, inputs.labels).flatten()
         labelled = labels != IGNORE
         if not bool(labelled.any()):  # a view without a mask
             return terms

@@ -19,8 +19,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding, pad
 
+from beags_baselines.grouped_sums import grouped_sums
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.losses.reduction import grouped_sums, ordered_sum
+from beags_plugin.losses.reduction import ordered_sum
 
 CHANNELS = 6
 SOLID = 0.7  # alpha above which a pixel shows something

@@ -9,6 +9,7 @@ from math import log
 import torch
 from torch import Tensor
 
+from beags_baselines.ranked_labels import ranked_labels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.preparation.refiner_training import Edit, OwnTraining, TrainedScene
@@ -82,4 +83,4 @@ class FeatureTraining(OwnTraining):
 
     def ranks_of(self, view: int) -> Tensor:
         """Return the labels of a view, [H, W] int32, ranks or IGNORE."""
-        return self.ranks.ranked_labels(self.scene.labels[view].to(self.features.device))
+        return ranked_labels(self.ranks, self.scene.labels[view].to(self.features.device))

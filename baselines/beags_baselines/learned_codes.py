@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from beags_baselines import identity_codes
+from beags_baselines.ranked_labels import ranked_labels
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ranks import ClassRanks
@@ -63,7 +64,7 @@ class LearnedCodes:
             for index, camera in enumerate(scene.cameras):
                 if (labels := scene.labels[index]) is not None:
                     logits = self.classifier(self.rendered(surfels, camera))
-                    labels = ranks.ranked_labels(labels.to(logits.device))
+                    labels = ranked_labels(ranks, labels.to(logits.device))
                     counts += torch.stack(identity_codes.right_pixels(logits, labels)).cpu()
                 progress(index + 1, len(scene.cameras))
         right = self.figures["labelled_share"] = int(counts[0]) / max(int(counts[1]), 1)

@@ -25,9 +25,10 @@ from torch import Tensor
 from torch.nn.functional import cross_entropy, embedding
 from torch.utils.checkpoint import checkpoint
 
+from beags_baselines.grouped_sums import grouped_sums
 from beags_baselines.identity_codes import NORMALISER, THRESHOLD, Classify, probabilities
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.losses.reduction import grouped_sums, ordered_linear, ordered_mean, ordered_outer_sum, ordered_sum
+from beags_plugin.losses.reduction import ordered_linear, ordered_mean, ordered_outer_sum, ordered_sum
 
 SAMPLES = 32_768  # random pixels of L_con, with replacement
 LEAST_PIXELS = 20  # samples that an id must exceed

@@ -30,9 +30,10 @@ import torch
 from torch import Tensor
 
 from beags_baselines import object_entropy
+from beags_baselines.pixels import pixels_under
+from beags_baselines.ranked_labels import ranked_labels
 from beags_plugin.assignment.sparse_sums import TorchSparseSums, largest_in_rows
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.lifting import pixels_under
 from beags_plugin.core.membership import Membership
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
@@ -104,7 +105,7 @@ class LabelledTraining(OwnTraining):
         if inputs.labels is not None and options.weight > 0:
             phi = self.ranks.ranks(scene.class_ids())
             carried = torch.bincount(phi, minlength=len(self.ranks)) > 0
-            labels = self.ranks.ranked_labels(inputs.labels)
+            labels = ranked_labels(self.ranks, inputs.labels)
             labels = object_entropy.counted_labels(labels, carried, options.ignore_background)
             ranked = surfel_inputs(inputs.surfels, inputs.camera, sh_degree=0, class_ids=phi)
             ranked = replace(ranked, screen_shift=inputs.screen_shift)

@@ -12,7 +12,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from beags_plugin.losses.reduction import grouped_sums, ordered_linear, ordered_sum
+from beags_baselines.grouped_sums import grouped_sums
+from beags_plugin.losses.reduction import ordered_linear, ordered_sum
 
 CHANNELS = 16
 COSINE = 0.9

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from beags_baselines import identity_codes, object_codebook
 from beags_baselines.learned_codes import CodeTraining
+from beags_baselines.ranked_labels import ranked_labels
 from beags_plugin.core.membership import Membership
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.losses.base import LossInputs
@@ -66,7 +67,7 @@ class CodebookTraining(CodeTraining):
     def terms(self, inputs: LossInputs, step: int, base: Callable[[], Terms]) -> Terms:
         if inputs.labels is None:
             return {}
-        labels = self.ranks.ranked_labels(inputs.labels).flatten()
+        labels = ranked_labels(self.ranks, inputs.labels).flatten()
         labelled = labels != IGNORE
         if not bool(labelled.any()):  # a view without a mask
             return {}
@@ -125,7 +126,7 @@ class CodebookTraining(CodeTraining):
         scene, codes, surfels = self.scene, self.options.codes, self.scene.surfels().detach()
         with scene.stage("Giving codes to classes") as progress:
             for index, camera in enumerate(scene.cameras):
-                labels = self.ranks.ranked_labels(scene.labels[index]).flatten()
+                labels = ranked_labels(self.ranks, scene.labels[index]).flatten()
                 places = (labels != IGNORE).nonzero()[:, 0]
                 if len(places):
                     rendered = self.learned.rendered(surfels, camera).flatten(0, 1)[places]

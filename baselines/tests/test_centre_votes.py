@@ -12,9 +12,10 @@ from trained_scenes import trained_scene
 
 from beags_baselines import centre_votes
 from beags_baselines.centre_votes import decompose, members
+from beags_baselines.pixels import project_directions
 from beags_baselines.sagd import Decomposition, SagdRefiner
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.lifting import project, project_directions
+from beags_plugin.core.lifting import project
 from beags_plugin.core.rotations import quat_product, rotation_from_quat
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE

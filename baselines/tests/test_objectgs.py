@@ -10,6 +10,7 @@ from trained_scenes import FAR_APART, loss_inputs, trained_scene
 
 from beags_baselines.object_entropy import mean_area
 from beags_baselines.objectgs import LabelledTraining, ObjectGsRefiner
+from beags_baselines.ranked_labels import ranked_labels
 from beags_plugin.assignment.contributions import contributions
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
@@ -90,7 +91,7 @@ def test_classes_by_three_rules():
     scene = trained_scene()
     surfels, ranks = scene.surfels().clone(), ClassRanks(torch.tensor(FAR_APART))
     surfels.log_scales[0], surfels.opacity_logits[0] = 1.0, -2.0  # a faint veil far beyond its object
-    ranked = [ranks.ranked_labels(labels) for labels in scene.labels]
+    ranked = [ranked_labels(ranks, labels) for labels in scene.labels]
     found = contributions(surfels, scene.cameras, ranked, scene.rasterizer, scene.settings, 3)
     found = replace(found, classes=ranks)
     assigned = AssignedScene(

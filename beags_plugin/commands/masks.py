@@ -77,8 +77,6 @@ class Reproject:
     """Folder of the id images, if not those that the run was trained on."""
     classes_path: Path | None = None
     """File {"id": "name"} for them; classes.json beside the folder if there is one."""
-    min_confidence: float = 0.0
-    """Pixels whose winner has a smaller share of the votes are written as unlabelled (65535)."""
     run_size: bool = False
     """Work at the size that was trained on instead of that of the photographs: quicker, smaller masks."""
     data: Path | None = None
@@ -87,8 +85,6 @@ class Reproject:
     """Folder for masks, confidence, classes.json, report.json, before_after.png; reprojected/ beside config.yml."""
 
     def run(self) -> None:
-        if not 0.0 <= self.min_confidence <= 1.0:
-            raise UserError(f"min_confidence is {self.min_confidence}: it must be a share of the votes, 0 to 1.")
         with starting(self):
             from beags_plugin.objects.reproject_masks import (
                 ReprojectionOptions,
@@ -98,7 +94,7 @@ class Reproject:
         options = ReprojectionOptions(self.masks_path, self.classes_path, run_size=self.run_size, data=self.data)
         masks = reproject_run(self.load_config, options)
         output = self.output or self.load_config.parent / "reprojected"
-        for line in write_reprojection(masks, output, self.min_confidence):
+        for line in write_reprojection(masks, output):
             CONSOLE.print(line)
 
 

@@ -7,7 +7,6 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 
-MARGIN = 1.3
 TAU = 0.02
 """Depths that differ by at most this share lie on one surface; a surface nearer by more hides it (method, E5)."""
 
@@ -49,16 +48,6 @@ def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     return homogeneous[..., :2] / z[..., None], z
 
 
-def pixels_under(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the points inside the image and in front of the camera, and their pixels.
-
-    points: [P, 3] float. Returns three tensors [S] int64: indices of the points, ascending; rows; columns.
-    """
-    inside, row, column, _ = pixels_of(points, camera)
-    places = inside.nonzero()[:, 0]
-    return places, row[places], column[places]
-
-
 def pixels_of(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return which points lie inside the image and in front of the camera, and the pixels and depths of all.
 
@@ -69,23 +58,6 @@ def pixels_of(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor, T
     inside = (z > 0) & ((xy >= 0) & (xy < limit)).all(dim=-1)
     column, row = xy.nan_to_num().floor().long().clamp(min=0).minimum(limit - 1).unbind(dim=-1)
     return inside, row, column, z
-
-
-def project_directions(directions: Tensor, points: Tensor, camera: Camera) -> Tensor:
-    """Return J W d, [P, 2] pixels: how far each point moves in the image per unit step along its direction.
-
-    As in 3D Gaussian splatting, J is taken at the nearest point within ``MARGIN`` times the image's half width and
-    height, because it grows without bound outside.
-
-    directions, points: [P, 3] float, the points in front of the camera.
-    """
-    W, K = camera.rotation.to(points).T, camera.K.to(points)
-    x, y, z = (_times(points, W) + camera.translation.to(points)).unbind(-1)
-    dx, dy, dz = _times(directions, W).unbind(-1)
-    reach_x, reach_y = (MARGIN * size / (2 * float(K[k, k])) for k, size in enumerate((camera.width, camera.height)))
-    moved_x = (dx - (x / z).clamp(-reach_x, reach_x) * dz) / z
-    moved_y = (dy - (y / z).clamp(-reach_y, reach_y) * dz) / z
-    return torch.stack([K[0, 0] * moved_x + K[0, 1] * moved_y, K[1, 1] * moved_y], dim=-1)
 
 
 def _times(rows: Tensor, matrix: Tensor) -> Tensor:

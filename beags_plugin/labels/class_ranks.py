@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from beags_plugin.labels.class_ids import IGNORE
-
 
 class ClassRanks:
     """Ranks 0, 1, ... of class ids in ascending order, so that ties between classes are decided as by ids.
@@ -34,11 +32,6 @@ class ClassRanks:
         """Return the rank of each id, int32; ``len(self)`` for an unknown id. class_ids: int of any shape."""
         place = class_ids.reshape(-1).int().clamp(-1, len(self._table) - 2) + 1
         return self._table.to(place.device).index_select(0, place).view(class_ids.shape)
-
-    def ranked_labels(self, labels: Tensor) -> Tensor:
-        """Return the ranks of labels of any shape; IGNORE where they are IGNORE or an unknown id."""
-        ranks = self.ranks(labels)
-        return ranks.masked_fill_(ranks == len(self), IGNORE)
 
     def class_ids(self, ranks: Tensor) -> Tensor:
         """Return the ids of ranks 0 .. ``len(self)`` - 1, int32. ranks: int of any shape."""

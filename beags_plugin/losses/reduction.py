@@ -29,19 +29,6 @@ def ordered_mean(values: Tensor) -> Tensor:
     return ordered_sum(values) / max(values.numel(), 1)
 
 
-def grouped_sums(rows: Tensor, groups: Tensor, count: int) -> Tensor:
-    """Return [count, C], the sums of the rows of each group, 0 of none; differentiable.
-
-    rows: [P, C] float. groups: [P] int, below ``count``. Rows are added in their order and in float64, whatever the
-    number of threads; the sums have the rows' dtype.
-    """
-    channels = rows.shape[1]
-    # Determinism: index_add adds one by one only into a vector.
-    entries = groups.long()[:, None] * channels + torch.arange(channels, device=rows.device)
-    flat = rows.new_zeros(count * channels, dtype=torch.float64)
-    return flat.index_add(0, entries.view(-1), rows.double().reshape(-1)).view(count, channels).to(rows.dtype)
-
-
 def ordered_linear(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """Return rows @ weight.T + bias, value and gradients bit for bit the same for any number of threads.
 

@@ -138,11 +138,11 @@ def data_to_reproject(run: Run, options: ReprojectionOptions) -> RunData:
     return RunData(data, "val")
 
 
-def write_reprojection(run: ReprojectedRun, output: Path, min_confidence: float = 0.0) -> list[str]:
+def write_reprojection(run: ReprojectedRun, output: Path) -> list[str]:
     """Write masks, confidence maps, a report and a picture of the views that changed most; return a summary.
 
     All maps have the size that ``reproject_run`` was given, and the photos' lens distortion, so that
-    ``beags-data --masks-path`` can read them. min_confidence: less certain pixels become IGNORE.
+    ``beags-data --masks-path`` can read them.
     """
     from PIL import Image
 
@@ -151,16 +151,14 @@ def write_reprojection(run: ReprojectedRun, output: Path, min_confidence: float 
         for index, path in enumerate(mask_paths(run.manager.train_dataset.image_filenames)):
             voted = run.voted[index].numpy().astype(np.uint16)
             confidence = run.confidence[index].numpy()
-            doubtful = confidence < 255.0 * min_confidence
-            final = np.where(doubtful, np.uint16(IGNORE), voted)
             for folder in ("masks", "confidence"):
                 (output / folder / path).parent.mkdir(parents=True, exist_ok=True)
             files = run.manager.files["train"]
-            write_mask(output / "masks" / path, files.as_in_file(final, index))
+            write_mask(output / "masks" / path, files.as_in_file(voted, index))
             Image.fromarray(files.as_in_file(confidence, index, border=0)).save(output / "confidence" / path)
-            changes.append(_change(run, index, doubtful))
+            changes.append(_change(run, index))
         (output / "classes.json").write_text(json.dumps({str(i): name for i, name in run.classes.items()}, indent=1))
-        report = {"method": run.method, "seconds": run.seconds, "min_confidence": min_confidence, "views": changes}
+        report = {"method": run.method, "seconds": run.seconds, "views": changes}
         (output / "report.json").write_text(json.dumps(report, indent=1))
         order = sorted(range(len(changes)), key=lambda index: -changes[index]["changed"])[:6]
         before_and_after(output / "before_after.png", [run.changed(index) for index in order])
@@ -174,7 +172,7 @@ def write_reprojection(run: ReprojectedRun, output: Path, min_confidence: float 
     ]
 
 
-def _change(run: ReprojectedRun, index: int, doubtful: np.ndarray) -> dict[str, object]:
+def _change(run: ReprojectedRun, index: int) -> dict[str, object]:
     given, voted = run.given[index], run.voted[index]
     known = None if given is None else given != IGNORE
     confidence = run.confidence[index].float() / 255.0
@@ -183,7 +181,6 @@ def _change(run: ReprojectedRun, index: int, doubtful: np.ndarray) -> dict[str, 
         "labelled": 0 if known is None else int(known.sum()),
         "changed": 0 if known is None else int((known & (given != voted)).sum()),
         "mean_confidence": round(float(confidence.mean()), 4),
-        "doubtful": int(doubtful.sum()),
     }
 
 

@@ -12,6 +12,8 @@ from tyro.conf import Suppress
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.system.errors import UserError
 
+STREAM_ABOVE = 0.5  # GB (10^9 bytes)
+
 
 @dataclass
 class DataOptions:
@@ -43,14 +45,12 @@ class DataOptions:
     """Stems of images to hold out for evaluation besides."""
     orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
     """How the world is turned."""
-    center_method: Suppress[Literal["poses", "focus", "none"]] = "poses"
+    center_method: Suppress[Literal["poses", "none"]] = "poses"
     """How the world is centred."""
     auto_scale_poses: Suppress[bool] = True
     """Scale the world so that the cameras fit in +/- 1."""
     scale_factor: Suppress[float] = 1.0
     """Scale the world by this besides."""
-    scene_scale: Suppress[float] = 1.0
-    """Half the side of the scene box."""
     num_random_points: Suppress[int] = 50_000
     """Number of points to start from where the data brings none."""
     strict: bool = False
@@ -60,9 +60,13 @@ class DataOptions:
         """Raise ``UserError`` for an unusable value."""
         if self.downscale_factor is not None and not 1.0 <= self.downscale_factor < math.inf:
             raise UserError(f"downscale_factor is {self.downscale_factor}: give 1 (full size) or more.")
-        for name in ("scale_factor", "scene_scale"):
-            if not 0.0 < (value := getattr(self, name)) < math.inf:
-                raise UserError(f"{name} is {value}: give a number above 0.")
+        if not 0.0 < self.scale_factor < math.inf:
+            raise UserError(f"scale_factor is {self.scale_factor}: give a number above 0.")
+        if self.center_method not in ("poses", "none"):  # An older run may have another.
+            raise UserError(
+                f"center_method is {self.center_method!r}, which is gone: train again, or use the version that "
+                "wrote the run."
+            )
         if self.eval_interval < 0:
             raise UserError(f"eval_interval is {self.eval_interval}: give a number of views, or 0 to hold out none.")
         if self.num_random_points < 4:
@@ -86,9 +90,7 @@ class ViewOptions:
 
     stream: Literal["auto", "always", "never"] = "auto"
     """Whether images are read from disk when needed instead of being kept in memory, with the same results; auto: if
-    those of a split would take more than stream_above_gb."""
-    stream_above_gb: Suppress[float] = 0.5
-    """GB (10^9 bytes) that the images of a split may take in memory before they are streamed."""
+    those of a split would take more than half a GB."""
     dense_seeds: Literal["auto", "on", "off"] = "auto"
     """Whether a base begins with more seed points, on whose depth several photos agree; auto: where there are at most
     50 photos, of which features give few points. It takes one or two seconds a photo."""
@@ -99,6 +101,10 @@ class ViewOptions:
     that goes on with another sees some if that did."""
     photos: Literal["all", "objects"] = "all"
     """What training sees of the photos: all, or objects, their pixels alone before a random colour (turntables)."""
+
+    def streams(self, gb: float) -> bool:
+        """Return whether images of a split, ``gb`` GB (10^9 bytes) in memory, are read when needed instead."""
+        return self.stream == "always" or (self.stream == "auto" and gb > STREAM_ABOVE)
 
     def __setattr__(self, name: str, value: object) -> None:
         """Keep ``data`` absolute, so that a saved config.yml works from any folder."""

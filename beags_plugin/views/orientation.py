@@ -11,17 +11,14 @@ import torch
 from torch import Tensor
 
 
-def oriented(poses: Tensor, method: str, center_method: str) -> tuple[Tensor, Tensor]:
+def oriented(poses: Tensor, method: str, centred: bool) -> tuple[Tensor, Tensor]:
     """Turn and centre poses [V, 4, 4] float32; return them [V, 3, 4], and the transform [3, 4] applied.
 
-    method: pca, up, vertical or none. center_method: poses, focus or none. Raises ``ValueError`` for another.
+    method: pca, up, vertical or none; raises ``ValueError`` for another. centred: on the cameras' middle.
     """
     origins = poses[:, :3, 3]
     middle = torch.mean(origins, dim=0)
-    if center_method not in ("poses", "focus", "none"):
-        raise ValueError(f"unknown center_method {center_method!r}")
-    center = {"poses": lambda: middle, "focus": lambda: _focus(poses, middle), "none": lambda: torch.zeros(3)}
-    translation = center[center_method]()
+    translation = middle if centred else torch.zeros(3)
     if method == "none":
         transform = torch.eye(4)
         transform[:3, 3] = -translation
@@ -76,19 +73,3 @@ def _rotation_between(first: Tensor, second: Tensor) -> Tensor:
     cross = torch.tensor([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
     angle = torch.acos(torch.clip(torch.dot(first, second), -1, 1))
     return torch.eye(3) + torch.sin(angle) * cross + (1 - torch.cos(angle)) * (cross @ cross)
-
-
-def _focus(poses: Tensor, middle: Tensor) -> Tensor:
-    """Return the point [3] closest to the optical axes of the cameras that have it in front of them."""
-    directions, origins = -poses[:, :3, 2:3], poses[:, :3, 3:4]
-    focus = middle
-    active = torch.sum(directions.squeeze(-1) * (focus - origins.squeeze(-1)), dim=-1) > 0
-    while torch.sum(active.int()) > 1:
-        directions, origins = directions[active], origins[active]
-        across = torch.eye(3) - directions * torch.transpose(directions, -2, -1)
-        squared = torch.transpose(across, -2, -1) @ across
-        focus = torch.linalg.inv(squared.mean(0)) @ (squared @ origins).mean(0)[:, 0]
-        active = torch.sum(directions.squeeze(-1) * (focus - origins.squeeze(-1)), dim=-1) > 0
-        if active.all():
-            break
-    return focus

@@ -68,7 +68,7 @@ def place(
     near[:, :3, 3] -= origin
     try:
         method = orientation or options.orientation_method
-        poses, transform = oriented(near.float(), method, options.center_method)
+        poses, transform = oriented(near.float(), method, centred=not keep)
     except ValueError as error:
         raise UserError(
             f"{file} asks for the orientation {orientation!r}, which is none of pca, up, vertical and none: correct "

@@ -41,8 +41,7 @@ class RunData:
     """The training and held-out views of a run, as its data manager gave them, on the CPU.
 
     held_out: the split "eval", which is val or test. scene: of the options, if it is already open. Photos stay in
-    memory if all of a split take at most ``stream_above_gb`` of the options. Raises ``UserError`` for data that cannot
-    be read.
+    memory unless ``config`` streams them. Raises ``UserError`` for data that cannot be read.
     """
 
     def __init__(
@@ -75,7 +74,7 @@ class RunData:
         photo: dict[str, Any] = files.photo(index, self.config.cache_images_type)
         bytes_of_pixel = photo["image"].shape[2] * photo["image"].element_size()
         gb = sum(width * height for width, height in files.dataset.file_sizes) * bytes_of_pixel / 1e9
-        if self.config.stream != "always" and (self.config.stream == "never" or gb <= self.config.stream_above_gb):
+        if not self.config.streams(gb):
             self._photos[split, index] = photo
         return photo
 

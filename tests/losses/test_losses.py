@@ -17,7 +17,7 @@ from beags_plugin.losses.boundary import BoundaryLoss
 from beags_plugin.losses.distortion import DistortionLoss
 from beags_plugin.losses.normal import NormalConsistencyLoss, depth_normals
 from beags_plugin.losses.photometric import PhotometricLoss, blur, ssim, ssim_map
-from beags_plugin.losses.reduction import grouped_sums, ordered_linear, ordered_mean, ordered_outer_sum, ordered_sum
+from beags_plugin.losses.reduction import ordered_linear, ordered_mean, ordered_outer_sum, ordered_sum
 
 
 def _inputs(camera=None, image=None, labels=None, **render) -> LossInputs:
@@ -125,14 +125,9 @@ def test_ordered_sums():
     assert torch.autograd.gradcheck(lambda x: ordered_sum(x**2), _random(2000)[:1500].requires_grad_(), fast_mode=True)
 
 
-def test_sums_of_groups_and_of_outer_products():
+def test_sums_of_outer_products():
     values, others = _random(5_000).view(-1, 4), _random(3_750, seed=1).view(-1, 3)
-    groups = torch.arange(1_250) % 7
-    one_hot = torch.nn.functional.one_hot(groups, 9).to(values)
-    torch.testing.assert_close(grouped_sums(values, groups, 9), one_hot.T @ values)  # two groups without rows
     torch.testing.assert_close(ordered_outer_sum(values, others), values.T @ others)
-    assert torch.autograd.gradcheck(lambda x: grouped_sums(x**2, groups, 9), values.requires_grad_(), fast_mode=True)
-    assert grouped_sums(torch.zeros(0, 2), groups[:0], 3).tolist() == [[0.0, 0.0]] * 3
 
 
 @pytest.mark.parametrize("count", [3, 64 * 64, 5_000])

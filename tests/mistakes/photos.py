@@ -85,7 +85,6 @@ def folder_of(*names: str):
 mistakes(
     "photos",
     {
-        "no folder to find poses for": beags_after(lambda at: None, f"{PROCESS} nowhere"),
         "none to find poses for": beags_after(lambda at: (at.root / "taken").mkdir(), f"{PROCESS} taken"),
         "two to find poses for": beags_after(folder_of("a.png", "b.png"), f"{PROCESS} taken"),
         "16 bits, to find poses for": beags_after(

@@ -11,10 +11,9 @@ import pytest
 
 pycolmap = pytest.importorskip("pycolmap")
 from data_folders import noise, write_image
-from photographed_corner import camera, frames, photograph, quiet, write_photos
+from photographed_corner import camera, errors, frames, photograph, quiet, write_photos
 from PIL import Image
 
-from beags_benchmarks.studies.poses import errors
 from beags_plugin.commands.cli import main
 from beags_plugin.posing import features, mapping
 from beags_plugin.posing.features import _features as find_features

@@ -9,10 +9,9 @@ import pytest
 
 pytest.importorskip("av")
 pytest.importorskip("pycolmap")
-from photographed_corner import camera, film, frames, look_alike, photograph, quiet
+from photographed_corner import camera, errors, film, frames, look_alike, photograph, quiet
 from PIL import Image
 
-from beags_benchmarks.studies.poses import errors
 from beags_plugin.posing.process import process
 from beags_plugin.posing.video import choose_frames, find_frames, write_frames
 

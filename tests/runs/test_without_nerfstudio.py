@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import fields
@@ -16,6 +17,7 @@ pytest.importorskip("nerfstudio")
 
 from run_folders import write_prepared, write_scene, write_trained
 
+from beags_plugin.commands.cli import main
 from beags_plugin.plugin.options.saved_config import load_run_config, open_for_training
 from beags_plugin.runs.relocation import open_run
 from beags_plugin.runs.run_config import read_run_config
@@ -105,7 +107,20 @@ def test_a_run_with_options_that_are_gone_still_opens(config, tmp_path):
     gone = "    pyramid: !!python/object:beags_plugin.plugin.options.pyramid.PyramidConfig\n      levels: 2\n    near:"
     text = config.read_text()
     assert "    near:" in text
-    config.write_text(text.replace("    near:", gone))
+    older = re.sub(r"(\n +)(scale_factor|stream): ", r"\1scene_scale: 2.0\1stream_above_gb: 0.1\1\2: ", text)
+    assert older.count("stream_above_gb") == 2
+    config.write_text(older.replace("    near:", gone))
     assert read_run_config(config).model_config.near == load_run_config(config).model_config.near
+    main(["eval", "--load-config", str(config), "--json", str(tmp_path / "eval.json")])
+    assert (tmp_path / "eval.json").exists()
     made = write_run(open_run(config), tmp_path / "part", {}, 3)
     assert "pyramid" not in made.read_text() and load_run_config(made).model_config.near == 0.01
+
+
+def test_a_run_centred_as_no_longer_possible_is_refused_in_one_sentence(config, capsys):
+    text = config.read_text()
+    assert "center_method: none" in text
+    config.write_text(text.replace("center_method: none", "center_method: focus"))
+    with pytest.raises(SystemExit):
+        main(["eval", "--load-config", str(config)])
+    assert "center_method is 'focus', which is gone: train again, or use the version" in capsys.readouterr().out

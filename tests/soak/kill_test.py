@@ -35,8 +35,6 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks"), str(Path(__file__).resolve(
 import forked  # noqa: E402
 import same_bits  # noqa: E402
 
-from beags_benchmarks.provenance import commit, describe_machine  # noqa: E402
-
 OPTIONS = {
     "pipeline.model.base_steps": 80, "pipeline.model.refine_steps": 30,
     "pipeline.model.densify.start": 20, "pipeline.model.densify.stop": 70, "pipeline.model.densify.every": 20,
@@ -181,6 +179,8 @@ class Tester:
 
 def main() -> int:
     """Parse arguments, kill, report; returns the exit code."""
+    from beags_benchmarks.provenance import commit, describe_machine
+
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=8, help="how many kills, at least")
     parser.add_argument("--again", type=float, default=0.2, help="share of resumes that are killed too")

@@ -26,7 +26,6 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
-from beags_benchmarks.provenance import commit, describe_machine  # noqa: E402
 from beags_plugin.sample.writer import SampleConfig, write_sample
 from beags_plugin.system.child_processes import bound
 
@@ -37,6 +36,8 @@ OBSERVED = Path(__file__).with_name("observed_training.py")
 
 def main() -> int:
     """Parse arguments, train, judge, report; returns the exit status."""
+    from beags_benchmarks.provenance import commit, describe_machine
+
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=2000, help="of refinement")
     parser.add_argument("--base-steps", type=int, default=600)

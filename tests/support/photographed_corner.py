@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 from PIL import Image
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
@@ -37,6 +38,11 @@ def camera(angle: float, height: float = 1.4) -> np.ndarray:
     pose = np.eye(4)
     pose[:3] = np.stack([right, np.cross(back, right), back, center], axis=1)
     return pose
+
+
+def errors(found: dict[str, np.ndarray], given: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors of rotation and position of each pose; without beags_benchmarks the test is skipped."""
+    return pytest.importorskip("beags_benchmarks.studies.poses").errors(found, given)
 
 
 def photograph(

@@ -15,7 +15,6 @@ from photographed_box import EXPOSURES, EYES, a_box, camera_from, photo_of
 from scipy.sparse.linalg import lsmr
 from threadpoolctl import threadpool_limits
 
-from beags_benchmarks.studies.meshes import Drawn
 from beags_plugin.core.cameras import Camera
 from beags_plugin.surfaces.atlas import picture, texels, unwrapped
 from beags_plugin.surfaces.baking import Places, baked
@@ -56,7 +55,8 @@ def mean_picture(mesh: Mesh, photos: list[Photo]):
 def error(mesh: Mesh, atlas, image: np.ndarray, camera: Camera) -> float:
     """Return the root mean square difference to a photo that nobody was given, well inside its outline."""
     photo = photo_of(mesh, camera, light=print_at, rays=3)
-    drawn = Drawn(mesh.vertices[atlas.source], atlas.faces, None, atlas.uv, image / 255.0)
+    meshes = pytest.importorskip("beags_benchmarks.studies.meshes")
+    drawn = meshes.Drawn(mesh.vertices[atlas.source], atlas.faces, None, atlas.uv, image / 255.0)
     shown, there = drawn.seen_by(camera, np.eye(4))
     inside = photo.own().numpy() & there
     inside &= np.roll(inside, 2, 0) & np.roll(inside, -2, 0) & np.roll(inside, 2, 1) & np.roll(inside, -2, 1)

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 pytest.importorskip("nerfstudio")
+pytest.importorskip("beags_benchmarks", reason="it generates photos that differ in exposure")
 
 from beags_benchmarks.samples.config import VariedSample
 from beags_plugin.plugin.views import datamanager as managing

@@ -74,7 +74,7 @@ SOURCES = {
 }
 
 
-@pytest.mark.parametrize("options", [{}, {"center_method": "focus"}, {"orientation_method": "pca"}, AS_GIVEN], ids=str)
+@pytest.mark.parametrize("options", [{}, {"orientation_method": "pca"}, AS_GIVEN], ids=str)
 @pytest.mark.parametrize("source", SOURCES)
 def test_points_stay_where_the_photos_show_them(tmp_path, source, options, capsys):
     SOURCES[source](tmp_path)

@@ -297,12 +297,8 @@ def test_matrices_of_three_rows(tmp_path):
 
 
 WRONG = {
-    "no camera at all": (lambda meta: (meta.pop("fl_x"), meta.pop("fl_y")), "has no fl_x, neither for all frames nor"),
-    "an angle in degrees": (lambda meta: meta.update(camera_angle_x=69.0), "camera_angle_x = 69.0, which must be radi"),
     "a lens of another kind": (lambda meta: meta.update(ftheta_p0=0.1), "has an f-theta lens: undistort"),
-    "an unknown model": (lambda meta: meta.update(camera_model="MAGIC"), "of the model 'MAGIC', which is unknown"),
     "five lens parameters": (lambda meta: meta.update(distortion_params=[0.0] * 5), "distortion_params that are not"),
-    "a panorama of instant-ngp": (lambda meta: meta.update(camera_model="EQUIRECTANGULAR"), "type EQUIRECTANGULAR"),
     "an orientation": (lambda meta: meta.update(orientation_override="left"), "orientation 'left', which is none of"),
     "no split": (lambda meta: meta.update(train_filenames="all"), "train_filenames that are no list of paths"),
     "no shift": (lambda meta: meta.update(applied_transform=[[1, 0], [0, 1]]), "applied_transform that is no matrix"),

@@ -11,6 +11,7 @@ from distorted_views import manager, write_distorted
 
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import CompressedMap, to_int32
+from beags_plugin.views import data_options
 from beags_plugin.views.streaming import Lazy, StreamedViews
 
 
@@ -42,11 +43,12 @@ def test_batches_and_views_are_the_same_bit_for_bit(tmp_path, model, kind):
     assert same(cached.next_eval_image(0)[1], streamed.next_eval_image(0)[1])
 
 
-def test_it_is_chosen_by_the_size_of_the_images(tmp_path):
+def test_it_is_chosen_by_the_size_of_the_images(tmp_path, monkeypatch):
     write_transforms(tmp_path)
     gigabytes = 7 * WIDTH * HEIGHT * 3 / 1e9
     for factor, kind, expected in ((1.01, "uint8", False), (0.99, "uint8", True), (1.01, "float32", True)):
-        data = manager(tmp_path, stream_above_gb=factor * gigabytes, cache_images_type=kind)
+        monkeypatch.setattr(data_options, "STREAM_ABOVE", factor * gigabytes)
+        data = manager(tmp_path, cache_images_type=kind)
         assert data.streams("train") is expected
         assert isinstance(data.cached_train, StreamedViews) is expected
 

@@ -91,13 +91,6 @@ class BeagsTrainerConfig(TrainerConfig):
     run_format: Suppress[int] = RUN_FORMAT
     """Version of the run's files."""
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Reject a run of another format when nerfstudio's own loader reads its config.yml."""
-        if state.get("run_format") != RUN_FORMAT:
-            print_user_errors_plainly()
-            raise other_format("this run", state.get("run_format"))
-        self.__dict__.update(state)
-
     @property
     def model_config(self) -> BeagsModelConfig:
         """Options of the model, with their own type."""
@@ -189,15 +182,21 @@ class BeagsTrainerConfig(TrainerConfig):
 
 
 def _read_by_nerfstudio(loader: yaml.constructor.SafeConstructor, node: yaml.Node) -> Iterator[BeagsTrainerConfig]:
-    """Build a config that an ns-* command reads, with the place where its run lies now."""
+    """Build a config that an ns-* command reads, with the place where its run lies now; reject another format."""
+    assert isinstance(node, yaml.MappingNode)
+    version = next((loader.construct_object(value) for key, value in node.value if key.value == "run_format"), None)
+    if version != RUN_FORMAT:
+        print_user_errors_plainly()
+        raise other_format("this run", version)
     config = BeagsTrainerConfig.__new__(BeagsTrainerConfig)
     yield config
-    assert isinstance(node, yaml.MappingNode)
-    config.__setstate__(cast(dict[str, Any], loader.construct_mapping(node, deep=True)))
+    config.__dict__.update(cast(dict[str, Any], loader.construct_mapping(node, deep=True)))
     place_for_nerfstudio(config)
 
 
-yaml.add_constructor(f"tag:yaml.org,2002:python/object:{__name__}.BeagsTrainerConfig", _read_by_nerfstudio, yaml.Loader)
+for _module in (__name__, "beags_plugin.plugin.config"):  # Runs of the first format name the second.
+    _tag = f"tag:yaml.org,2002:python/object:{_module}.BeagsTrainerConfig"
+    yaml.add_constructor(_tag, _read_by_nerfstudio, yaml.Loader)
 for _former, _kind in MOVED.items():
     _build = partial(yaml.constructor.SafeConstructor.construct_yaml_object, cls=_kind)
     yaml.add_constructor(f"tag:yaml.org,2002:python/object:{_former}", _build, yaml.Loader)

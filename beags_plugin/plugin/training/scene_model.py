@@ -24,9 +24,9 @@ from beags_plugin.preparation.refiner_training import OwnTraining
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs
 from beags_plugin.runs.checkpoint_file import exposures_of, extra_state
+from beags_plugin.splat_io.ply import thin_log_scales
 
 PARAMETER_GROUPS = ("means", "features_dc", "features_rest", "opacities", "scales", "quats")
-FLATNESS = 1e-3  # Exported third scale, relative to the smaller of the two: flat, but no viewer divides by 0.
 
 
 @dataclass(frozen=True)
@@ -141,9 +141,7 @@ class SceneModel(SplatfactoModel):
     @property
     def scales(self) -> Tensor:
         """[N, 3] logs of the scales for exporters; the third, which the parameter lacks, is thin."""
-        flat = self.gauss_params["scales"]
-        thin = flat.min(dim=-1, keepdim=True).values + torch.log(flat.new_tensor(FLATNESS))
-        return torch.cat([flat, thin], dim=-1)
+        return thin_log_scales(self.gauss_params["scales"])
 
     def surfels(self) -> Surfels:
         """Return the scene; it shares storage and gradients with the parameters."""

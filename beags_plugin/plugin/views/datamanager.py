@@ -135,9 +135,7 @@ class BeagsDataManager(FullImageDatamanager[BeagsDataset]):
 
     def streams(self, split: Split) -> bool:
         """Return whether the images of a split are read from disk whenever they are needed."""
-        if self.config.stream == "auto":
-            return self._cache_gb(split) > self.config.stream_above_gb
-        return self.config.stream == "always"
+        return self.config.streams(self._cache_gb(split))
 
     def _cache_gb(self, split: Split) -> float:
         bytes_of_pixel = 3 * (1 if self.config.cache_images_type == "uint8" else 4)

@@ -59,11 +59,11 @@ class BeagsDataParser(SceneData, DataParser):
         SceneData.__init__(self, config)
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
-        views, side = self.split(split), self.config.scene_scale
+        views = self.split(split)
         return PlacedOutputs(
             image_filenames=views.images,
             cameras=nerfstudio_cameras(views.cameras),
-            scene_box=SceneBox(aabb=torch.tensor([[-side] * 3, [side] * 3])),
+            scene_box=SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3])),
             dataparser_transform=views.placing.original,
             dataparser_scale=views.placing.original_scale,
             metadata=views.metadata,
