@@ -23,7 +23,7 @@ from beags_plugin.system.whole_files import write_text_atomically
 STAMP = "trained.json"  # This file beside the run holds the request that it was trained for.
 STARTED = "started"  # This key of it holds the request until the training ends.
 AGREE = ("--pipeline.model.prepare.agree", "True")  # A network's masks have the same errors in many views.
-QUIET = ("--logging.steps-per-log", "50", "--logging.local-writer.max-log-size", "0")  # Used if output is no terminal.
+QUIET = ("--logging.steps-per-log", "200", "--logging.local-writer.max-log-size", "0")  # Used if output is no terminal.
 
 
 def train_once(

@@ -28,10 +28,16 @@ class ChosenSource:
     options: tuple[str, ...] = ()
 
     def below(self, data: Path) -> ChosenSource:
-        """Return the source with absolute paths for options that name files in ``data``."""
-        options = []
+        """Return the source with absolute paths for options that name files in ``data``, also by default."""
+        from beags_plugin.masks.sources import MASK_SOURCES
+
+        options, named = [], {option.partition("=")[0] for option in self.options}
         for key, equals, value in (option.partition("=") for option in self.options):
             options.append(f"{key}{equals}{data.absolute() / value if (data / value).is_file() else value}")
+        for field in fields(MASK_SOURCES.get(self.name)):
+            usual = field.default
+            if field.name not in named and isinstance(usual, Path) and (data / usual).is_file():
+                options.append(f"{field.name}={data.absolute() / usual}")
         return replace(self, options=tuple(options))
 
     def source(self, called: str = "") -> MaskSource:

@@ -8,6 +8,7 @@ from typing import TypedDict, cast
 
 from beags_plugin.data.dataset import Dataset, FilesOfObject
 from beags_plugin.data.files import files_of_views
+from beags_plugin.system.wording import verb
 
 FilesPerView = list[Path | None]
 OF_OBJECTS = ("visible", "silhouettes", "seen", "removed", "removed_shown")
@@ -76,7 +77,8 @@ def stray_note(folder: Path, images: Sequence[Path], images_root: Path) -> str |
             f"No exact mask in {folder} has the name of a photo here ({images[0].stem}.png, ...), so none counts: name "
             f"them as their photos, or remove them if they are of another scene."
         )
+    have, do = verb(len(strays), "have"), verb(len(strays), "do")
     return (
-        f"{len(strays)} of the {len(present)} files in {folder} have the name of no photo that has a pose, and do not "
-        f"count, {strays[0].relative_to(folder)} among them: name them as their photos, or remove them."
+        f"{len(strays)} of the {len(present)} files in {folder} {have} the name of no photo that has a pose, and {do} "
+        f"not count, {strays[0].relative_to(folder)} among them: name them as their photos, or remove them."
     )

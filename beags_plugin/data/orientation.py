@@ -10,6 +10,7 @@ import numpy as np
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.pasted import quoted
 from beags_plugin.system.reading.images import read_image
+from beags_plugin.system.wording import amount
 
 TAG = 274  # EXIF's tag of the orientation
 LYING = (5, 6, 7, 8)  # its values that swap width and height
@@ -91,6 +92,6 @@ def turned_note(photos: Sequence[Path]) -> str | None:
         return None
     photo, turned = stored[0]
     return (
-        f"{len(stored)} photos are stored turned, the first of them {photo} with EXIF orientation {turned}: masks "
-        "must lie as the photos are stored; turn upright ones with beags masks make --upright."
+        f"{amount(len(stored), 'photo', 'are')} stored turned, the first of them {photo} with EXIF orientation "
+        f"{turned}: masks must lie as the photos are stored; turn upright ones with beags masks make --upright."
     )

@@ -78,7 +78,7 @@ def render_run(
         lines.append("Seconds: " + ", ".join(f"{stage} {value:.1f}" for stage, value in seconds.items()))
     if peak_memory_mb:
         lines.append(f"Peak memory: {peak_memory_mb:.0f} MB")
-    return Group(*parts, *(Text(line) for line in (*lines, *run.notes, protocol_line([run]))))
+    return Group(*parts, *(Text(line) for line in (*lines, *run.notes, protocol_line([run])) if line))
 
 
 def render_data_set(metrics: DataSetMetrics) -> RenderableType:
@@ -94,11 +94,12 @@ def render_data_set(metrics: DataSetMetrics) -> RenderableType:
     scenes.append([(metrics.name, content["mean"], content)])
     table = _mask_table("All scenes", "scene", [row for scene in scenes for row in scene], stages)
     more = _more_tables("All scenes", "scene", [scene[0] for scene in scenes], stages)
-    return Group(table, *more, Text(protocol_line(metrics.runs)))
+    protocol = protocol_line(metrics.runs)
+    return Group(table, *more, *([Text(protocol)] if protocol else []))
 
 
 def protocol_line(runs: Sequence[RunMetrics]) -> str:
-    """Return a sentence with all choices behind the scores of runs of one protocol."""
+    """Return sentences with all choices behind the scores of runs of one protocol; "" if none needs one."""
     return protocol_sentence(
         runs[0].protocol,
         [run.after.extracted_truth for run in runs],
@@ -111,39 +112,39 @@ def protocol_line(runs: Sequence[RunMetrics]) -> str:
 def protocol_sentence(
     protocol: Protocol, truths: Iterable[str | None], *, removal: bool, shown: bool, fitted: bool
 ) -> str:
-    """Return a sentence with all choices behind scores.
+    """Return sentences with all choices behind scores; "" if none needs one.
 
-    truths: ``SceneMetrics.extracted_truth`` of each scene. removal, shown: whether there are such metrics. fitted:
-    whether a run has learned exposures.
+    truths: ``SceneMetrics.extracted_truth`` of each scene; without any, no mask is scored. removal, shown: whether
+    there are such metrics. fitted: whether a run has learned exposures.
     """
     known = {truth for truth in truths if truth is not None}
-    truth = _TRUTHS[known.pop() if len(known) == 1 else "both"] if known else "no masks"
-    of_removal = ""
+    sentences = []
+    if known:
+        truth = _TRUTHS[next(iter(known)) if len(known) == 1 else "both"]
+        scenes = "over scenes" if protocol.data_set_average == "scenes" else "of all scenes pooled"
+        sentences.append(
+            f"Protocol: extracted masks against {truth}; above {protocol.threshold:g}; boundary band and margin of "
+            f"spill {100 * protocol.band_share:g} % of the diagonal; the {protocol.resize} is resized; masks empty in "
+            f"truth and prediction are left out, IoU and BIoU of those empty in truth alone are 0; means over "
+            f"{protocol.scene_average}, then {scenes}."
+        )
     if removal:
-        of_removal = (
-            " Removal: the scene without the object's Gaussians against the exact picture without it, over the whole "
+        sentences.append(
+            "Removal: the scene without the object's Gaussians against the exact picture without it, over the whole "
             "silhouette; shown: where the latter shows surface that some training view shows; remains: pixels nearer "
             f"to the photo, of those where the two differ by {TELLING:g} or more."
         )
-    of_shown = ""
     if shown:
-        of_shown = (
-            " PSNR shown: over the pixels whose surface (median depth before refinement, else of the run) some "
+        sentences.append(
+            "PSNR shown: over the pixels whose surface (median depth before refinement, else of the run) some "
             f"training view shows within {100 * TAU:g} % of its depth."
         )
-    of_fitted = ""
-    if fitted:
-        of_fitted = (
-            " Of runs that have learned the photos' exposures, PSNR shown, PSNR objects and removals are taken after "
-            "the colour fit of the whole view."
+    if fitted and sentences:
+        what = "PSNR shown, PSNR objects and removals are" if known else "PSNR shown is"
+        sentences.append(
+            f"Of runs that have learned the photos' exposures, {what} taken after the colour fit of the whole view."
         )
-    scenes = "over scenes" if protocol.data_set_average == "scenes" else "of all scenes pooled"
-    return (
-        f"Protocol: extracted masks against {truth}; above {protocol.threshold:g}; boundary band and margin of spill "
-        f"{100 * protocol.band_share:g} % of the diagonal; the {protocol.resize} is resized; masks empty in truth and "
-        f"prediction are left out, IoU and BIoU of those empty in truth alone are 0; means over "
-        f"{protocol.scene_average}, then {scenes}.{of_removal}{of_shown}{of_fitted}"
-    )
+    return " ".join(sentences)
 
 
 def _worst(run: Mapping[str, Any]) -> list[_Row]:

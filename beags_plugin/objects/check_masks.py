@@ -32,6 +32,7 @@ from beags_plugin.pictures.masks import Changed, Pointed, contradicted_picture, 
 from beags_plugin.runs.relocation import open_run
 from beags_plugin.system.errors import writing
 from beags_plugin.system.progress import progress_bar
+from beags_plugin.system.wording import amount
 from beags_plugin.views.data_options import DataOptions
 from beags_plugin.views.poses import PosedViews
 from beags_plugin.views.scene_data import SceneData
@@ -64,11 +65,11 @@ class Report:
 
     def summary(self) -> str:
         """Return a line with the numbers of views, objects and issues."""
-        counts = [f"{sum(f.level == level for f in self.issues)} {level}s" for level in LEVELS]
-        objects = sum(i != 0 for i in self.coverage.ids)
+        counts = [amount(sum(f.level == level for f in self.issues), level) for level in LEVELS]
+        objects, masks = sum(i != 0 for i in self.coverage.ids), int(self.coverage.usable.sum())
         return (
-            f"{self.data}: {len(self.stems)} views, {int(self.coverage.usable.sum())} usable masks, {objects} objects; "
-            f"{', '.join(counts)}."
+            f"{self.data}: {amount(len(self.stems), 'view')}, {amount(masks, 'usable mask')}, "
+            f"{amount(objects, 'object')}; {', '.join(counts)}."
         )
 
     @property
@@ -101,7 +102,7 @@ class Report:
         """Return the lines of the printed report: objects, issues with their costs, summary."""
         objects = self.objects()
         if len(objects) > MOST_OBJECTS:
-            objects[MOST_OBJECTS:] = [f"and {len(objects) - MOST_OBJECTS} more objects"]
+            objects[MOST_OBJECTS:] = [f"and {amount(len(objects) - MOST_OBJECTS, 'more object')}"]
         issues = [f"{issue.level}: {issue.message}\n    costs: {issue.cost}" for issue in self.issues]
         return [*objects, *issues, *([self.compared] if self.compared else []), self.summary()]
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from beags_plugin.cleaning.clean import LeftOut
 from beags_plugin.surfaces.closing_surfels import Added
+from beags_plugin.system.wording import amount
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Exported:
 
     def __str__(self) -> str:
         """Return a line for users."""
-        facts = [f"{self.gaussians} Gaussians", *(str(each) for each in (self.left_out, self.added) if each)]
+        facts = [amount(self.gaussians, "Gaussian"), *(str(each) for each in (self.left_out, self.added) if each)]
         return f"{self.name}: {'; '.join(facts)}"
 
     def to_json(self, folder: Path) -> dict[str, Any]:

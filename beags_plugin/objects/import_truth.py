@@ -20,6 +20,7 @@ from beags_plugin.labels.classes import UNTOLD, read_object_mask, write_mask
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.pasted import quoted
 from beags_plugin.system.whole_files import write_text_atomically
+from beags_plugin.system.wording import amount, verb
 from beags_plugin.views.data_options import DataOptions
 from beags_plugin.views.scene_data import SceneData
 
@@ -61,9 +62,11 @@ def import_truth(data: DataOptions, objects: Sequence[DownloadedObject], overwri
                 "photos with the camera's names, or write original_names.txt (docs/data.md)."
             )
         written = len(each.masks) - len(absent)
-        lines.append(f"{each.name}: {written} visible {'mask' if written == 1 else 'masks'} in {truth / each.name}")
+        lines.append(f"{each.name}: {amount(written, 'visible mask')} in {truth / each.name}")
         if absent:
-            lines.append(f"{each.name}: {len(absent)} masks of other photos are left out ({absent[0]}, ...).")
+            others, are = amount(len(absent), "mask"), verb(len(absent), "are")
+            first = absent[0] if len(absent) == 1 else f"{absent[0]}, ..."
+            lines.append(f"{each.name}: {others} of other photos {are} left out ({first}).")
     entries = []
     for index, each in enumerate(objects, start=1):
         if each.scribbles is not None and (image := photo(each.scribbles.view)) is not None:

@@ -31,6 +31,7 @@ from beags_plugin.runs.run import Run
 from beags_plugin.system.errors import UserError, check_choice, writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.whole_files import write_whole
+from beags_plugin.system.wording import amount
 from beags_plugin.views.data_options import DataOptions
 from beags_plugin.views.scene_data import SceneData
 
@@ -192,8 +193,8 @@ def make_masks(
             checked.append(f"{masks / NO_TRUTH} says that those of held-out views will be no truth to evaluate with.")
     return [
         *made.notes,
-        f"{len(shares)} masks of {len(photos)} views, {len(names) - 1} objects, which cover "
-        f"{100 * np.mean(shares):.1f} % on average: {masks}",
+        f"{amount(len(shares), 'mask')} of {amount(len(photos), 'view')}, {amount(len(names) - 1, 'object')}, "
+        f"{100 * np.mean(shares):.1f} % covered on average: {masks}",
         f"names: {classes}; look at {folder / 'made.png'}",
         *checked,
     ]

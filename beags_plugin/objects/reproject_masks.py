@@ -25,6 +25,7 @@ from beags_plugin.runs.run import Run
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.filed_tensors import filed
 from beags_plugin.system.progress import counted, progress_bar
+from beags_plugin.system.wording import amount
 from beags_plugin.views.run_data import RunData
 
 if TYPE_CHECKING:
@@ -167,7 +168,7 @@ def write_reprojection(run: ReprojectedRun, output: Path) -> list[str]:
     return [
         *([run.why] if run.why else []),
         f"{changed} of {pixels} labelled pixels changed ({100 * changed / max(pixels, 1):.2f} %), "
-        f"{filled} views without a mask got one, in {run.seconds:.1f} s",
+        f"{amount(filled, 'view')} without a mask got one, in {run.seconds:.1f} s",
         *(f"{output / name}" for name in ("masks", "confidence", "classes.json", "report.json", "before_after.png")),
     ]
 

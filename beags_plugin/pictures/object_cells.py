@@ -15,14 +15,14 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.records import EvalView
 from beags_plugin.evaluation.truths import extracted_truth
 from beags_plugin.labels.class_ids import resize_nearest
-from beags_plugin.pictures.cells import GAP, Square, as_bytes, below, cell, checkerboard, square_around, wrapped
+from beags_plugin.pictures.cells import GAP, Square, as_bytes, below, beside, cell, checkerboard, square_around
 from beags_plugin.pictures.orbit import OrbitFrame, least_shown, orbit_frame, orbit_settings, shows, side, view_from
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.surfaces.frames import bounding_box
 
-COLUMNS = 6  # cells in a line
-SMALLEST, LARGEST = 300, 480  # bounds for the side of a cell, pixels
+COLUMNS = 6  # cells in a line with all its pictures
+SMALLEST, LARGEST = 300, 480  # bounds for the side of a cell of such a line, pixels
 FAINT = 0.1  # alpha from which a stray Gaussian widens the crop
 STRAYS = 1.3  # most that strays of earlier stages widen the crop of the last one, times its side
 _VIEWS = 2  # views in a line, each with photo, before and after
@@ -51,31 +51,48 @@ class _Shot:
 
 @dataclass(frozen=True)
 class ObjectShots:
-    """The pictures to render of an object. stages: caption to its Gaussians alone. pixels: side of the renders, at the
-    resolution of the photos' files, at most ``LARGEST``."""
+    """The pictures to render of an object. stages: caption to its Gaussians alone. in_views, sides: the pictures in
+    held-out views and from hidden sides. pixels: side of the renders at the resolution of the photos' files."""
 
     name: str
     stages: Mapping[str, Surfels]
-    shots: Sequence[_Shot]
+    in_views: Sequence[_Shot]
+    sides: Sequence[_Shot]
     pixels: int
 
     def cells(self, size: int, drawing: Drawing) -> np.ndarray:
-        """Return [H, W, 3] uint8: lines of ``COLUMNS`` cells that are ``size`` pixels wide."""
-        pixels, groups = min(self.pixels, size), []
-        for shot in self.shots:
-            photo = [] if shot.photo is None else [cell(shot.photo, (size, size), f"{self.name}, {shot.caption}")]
-            renders = []
+        """Return [H, W, 3] uint8: a line of held-out views and one of sides, as wide as ``COLUMNS`` cells of ``size``.
+
+        A line with fewer cells has larger ones, so that it is full.
+        """
+        width = COLUMNS * (size + GAP)
+        return below([beside(self._line(shots, width, drawing)) for shots in (self.in_views, self.sides) if shots])
+
+    def _line(self, shots: Sequence[_Shot], width: int, drawing: Drawing) -> list[np.ndarray]:
+        """Return the cells of some pictures, which fill a line of ``width`` pixels."""
+        photos = sum(shot.photo is not None for shot in shots)
+        size = filling(photos + len(shots) * len(self.stages), width)
+        cells = []
+        for shot in shots:
+            if shot.photo is not None:
+                cells.append(cell(shot.photo, (size, size), f"{self.name}, {shot.caption}"))
             for stage, surfels in self.stages.items():
-                image = alone(surfels, _sized(shot.camera, pixels), shot.settings, drawing.rasterizer)
-                caption = stage if photo else f"{shot.caption}: {stage}"
-                renders.append(cell(over_board(image, size), (size, size), caption))
-            groups.append([*photo, *renders])
-        return below(wrapped(groups, COLUMNS * (size + GAP)))
+                camera = _sized(shot.camera, min(self.pixels, size))
+                image = alone(surfels, camera, shot.settings, drawing.rasterizer)
+                caption = f"{shot.caption}: {stage}" if shot.photo is None else stage
+                cells.append(cell(over_board(image, size), (size, size), caption))
+        return cells
+
+
+def filling(count: int, width: int) -> int:
+    """Return the width of ``count`` cells that fill a line, at most half of it."""
+    return width // max(count, 2) - GAP
 
 
 def cell_size(objects: Sequence[ObjectShots]) -> int:
-    """Return one side for all cells of a sheet, so that its lines end together: the median of the objects' sides."""
-    return max(round(float(np.median([each.pixels for each in objects]))), SMALLEST) if objects else LARGEST
+    """Return one side for the cells of all full lines of a sheet: the median of the objects' sides, within bounds."""
+    sides = [min(each.pixels, LARGEST) for each in objects]
+    return max(round(float(np.median(sides))), SMALLEST) if sides else LARGEST
 
 
 def object_shots(
@@ -88,25 +105,25 @@ def object_shots(
 ) -> ObjectShots:
     """Return the pictures to render of an object, at the resolution of the photos' files.
 
-    The first line has two held-out photos from sides far apart, each with the object at every stage. The second has two
-    sides from below the horizon and the side that photos show least. Crops hold everything that is rendered of the last
-    stage, also strays; those of earlier stages widen them by at most ``STRAYS``.
+    The first line has up to two held-out photos from sides far apart, each with the object at every stage. The second
+    has two sides from below the horizon and the side that photos show least. Crops hold everything that is rendered of
+    the last stage, also strays; those of earlier stages widen them by at most ``STRAYS``.
 
     stages: caption to the object's Gaussians alone; the last one with any defines its place. views: held-out views;
     those that do not show the object are left out. cameras: cameras of the training photos.
     """
     place = next(each for each in reversed(list(stages.values())) if len(each))
     stand = orbit_frame(*bounding_box(place), cameras)
-    shots = [_in_view(views[each], class_id, stages, drawing) for each in views_of(stand, views)]
-    pixels = min(max((shot.camera.width for shot in shots), default=LARGEST), LARGEST)
+    in_views = [_in_view(views[each], class_id, stages, drawing) for each in views_of(stand, views)]
+    pixels = max((shot.camera.width for shot in in_views), default=LARGEST)
     back = least_shown(stand, cameras, _LEVEL)
-    for caption, away in (
-        ("from below", side(stand, 0.0, _BELOW)),
-        ("from below, behind", side(stand, 180.0, _BELOW)),
-        ("least shown side", side(stand, back, _LEVEL)),
-    ):
-        shots.append(_from_side(stand, caption, away, pixels, stages, drawing))
-    return ObjectShots(name, stages, shots, pixels)
+    sides = {
+        "from below": side(stand, 0.0, _BELOW),
+        "from below, behind": side(stand, 180.0, _BELOW),
+        "least shown side": side(stand, back, _LEVEL),
+    }
+    from_sides = [_from_side(stand, caption, away, pixels, stages, drawing) for caption, away in sides.items()]
+    return ObjectShots(name, stages, in_views, from_sides, pixels)
 
 
 def views_of(stand: OrbitFrame, views: Sequence[EvalView]) -> list[int]:

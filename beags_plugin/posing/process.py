@@ -32,6 +32,7 @@ from beags_plugin.system.lock import run_lock
 from beags_plugin.system.memory import trim_memory
 from beags_plugin.system.progress import Bar
 from beags_plugin.system.whole_files import write_text_atomically
+from beags_plugin.system.wording import amount, verb
 
 REPORT = "poses.json"
 VERSION = 2  # version of the saved state; a state of another version is discarded
@@ -63,7 +64,7 @@ class Posed:
         """Return the figures as one line."""
         return (
             f"{self.registered} of {self.photos} photos have poses, reprojection error {self.reprojection_error:.2f} "
-            f"pixels, {self.points} points, {self.cameras} camera{'s' if self.cameras > 1 else ''}"
+            f"pixels, {self.points} points, {amount(self.cameras, 'camera')}"
         )
 
 
@@ -204,9 +205,11 @@ def _report(photos: list[Photo], looks: list[Look], model: Any, groups: list[lis
     without = sorted(set(names) - set(groups[0]))
     notes = []
     if places := blurred(looks):
-        notes.append(f"{_named(names, places)} look blurred beside their neighbours: leave out those that are.")
+        look, those = verb(len(places), "look"), "it out if it is" if len(places) == 1 else "out those that are"
+        notes.append(f"{_named(names, places)} {look} blurred beside other photos: leave {those}.")
     if places := repeated(looks):
-        notes.append(f"{_named(names, places)} show the same as an earlier photo: leave them out.")
+        show, them = verb(len(places), "show"), "it" if len(places) == 1 else "them"
+        notes.append(f"{_named(names, places)} {show} the same as an earlier photo: leave {them} out.")
     sizes = sorted({(photo.width, photo.height) for photo in photos})
     if {size[::-1] for size in sizes} == set(sizes) and len(sizes) == 2:
         notes.append("Some photos are portrait and some landscape: each kind got a camera of its own.")
@@ -223,8 +226,8 @@ def _report(photos: list[Photo], looks: list[Look], model: Any, groups: list[lis
     elif len(groups[0]) < SHARE * len(photos):
         lost = [names.index(name) for name in without]
         notes.append(
-            f"{_named(names, lost)} have no pose, too few of their points are in other photos: take photos between "
-            "them and the rest."
+            f"{_named(names, lost)} {verb(len(lost), 'have')} no pose, as other photos show too few of the same "
+            "points: take photos in between."
         )
     return Posed(
         len(photos), len(groups[0]), model.compute_mean_reprojection_error(), model.num_points3D(),

@@ -111,9 +111,9 @@ def refused(error: OSError) -> UserError | None:
 def silence_libraries() -> None:
     """Hide warnings that are meant for the authors of torch and nerfstudio; for programs that run beags alone.
 
-    Warnings of other code stay. With ``python -W`` or PYTHONWARNINGS, all warnings stay.
+    Warnings of other code stay. All stay if ``python -W`` or PYTHONWARNINGS asks for some.
     """
-    if sys.warnoptions:
+    if not all(option.startswith("ignore") for option in sys.warnoptions):
         return
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|nerfstudio)\.")
     warnings.filterwarnings("ignore", category=UserWarning, module=r"nerfstudio\.")

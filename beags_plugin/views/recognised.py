@@ -8,6 +8,7 @@ from typing import Any
 
 from beags_plugin.data.dataset import ColmapModel, Dataset, PoseTable, TransformsFile
 from beags_plugin.data.files import unposed_note
+from beags_plugin.system.wording import amount
 from beags_plugin.views.poses import PosedViews
 
 
@@ -27,12 +28,12 @@ def recognised(parser: Any, scene: Dataset, views: PosedViews, metadata: Mapping
         )
     unposed = None if isinstance(scene.poses, PoseTable) else unposed_note(views.images)
     notes += [note for note in (metadata["stray_truth"], unposed) if note is not None]
-    masks = metadata["mask_filenames"]
+    given = sum(mask is not None for mask in metadata["mask_filenames"])
     points = "random" if metadata["points3D_random"] else len(metadata["points3D_xyz"])
     line = (
-        f"{scene.root}: {scene.layout} layout, poses of {_source(scene)}, {len(views.images)} images in "
+        f"{scene.root}: {scene.layout} layout, poses of {_source(scene)}, {amount(len(views.images), 'image')} in "
         f"{views.images[0].parent.name} ({_split_in_words(parser, views, scene)}), "
-        f"{sum(mask is not None for mask in masks) or 'no'} masks, {points} seed points."
+        f"{amount(given, 'mask') if given else 'no masks'}, {points} seed points."
     )
     if scene.size_note and parser.config.downscale_factor in (None, scene.downscale):
         notes.append(scene.size_note)

@@ -28,7 +28,7 @@ def test_the_command_writes_masks_that_training_finds(tmp_path, capsys):
     arguments = ["masks", "make", "--data", str(tmp_path), "--source", "object-images", "--options", "folder=objects"]
     main(arguments)
     out = capsys.readouterr().out
-    assert "9 masks of 9 views, 1 objects" in out and (tmp_path / "made.png").exists()
+    assert "9 masks of 9 views, 1 object, " in out and (tmp_path / "made.png").exists()
     metadata = BeagsDataParserConfig(data=tmp_path).setup().get_dataparser_outputs("train").metadata
     assert metadata["classes"] == {0: "background", 1: "cup"} and all(metadata["mask_filenames"])
     np.testing.assert_array_equal(read_id_mask(tmp_path / "masks/v03.png"), truth(0) == 1)
@@ -77,7 +77,7 @@ def test_masks_of_gaussian_grouping_are_trained_on(tmp_path, capsys):
     folder = tmp_path / "made"
     main(["masks", "make", "--data", str(tmp_path), "--source", "gaussian-grouping", "--output", str(folder)])
     out = capsys.readouterr().out
-    assert "9 masks of 9 views" in out and "1 ids in fewer than 3 views" in out
+    assert "9 masks of 9 views" in out and "1 id in fewer than 3 views" in out
     config = BeagsDataParserConfig(data=tmp_path, masks_path=folder / "masks", classes_path=folder / "classes.json")
     metadata = config.setup().get_dataparser_outputs("train").metadata
     assert len(metadata["classes"]) == 3 and len(metadata["mask_filenames"]) == 7

@@ -183,6 +183,7 @@ def test_another_source_of_masks_is_asked_and_its_change_makes_them_anew(posed, 
     [
         (ChosenSource("rembg"), "rembg", "cannot fetch the weights of isnet-general-use"),
         (ChosenSource("sam2", ("model=/none/such",)), "transformers", "there is no folder /none/such"),
+        (ChosenSource("sam2", ("prompts=none.json",)), "transformers", r"the prompts none\.json cannot be read"),
     ],
 )
 def test_weights_that_lack_are_named_before_poses_are_computed(
@@ -193,8 +194,9 @@ def test_weights_that_lack_are_named_before_poses_are_computed(
         monkeypatch.setattr("beags_plugin.masks.sources.rembg.import_module", lambda name: NoWeights)
     else:
         pytest.importorskip(library, reason="the extra [sam2] (transformers) is not installed")
+        (photos / "prompts.json").write_text('{"objects": [{"name": "cup", "text": "cup"}]}')
     with pytest.raises(UserError, match=sentence):
-        scene_setup.made_scene(photos, tmp_path / "out", chosen=chosen)
+        scene_setup.made_scene(photos, tmp_path / "out", chosen=chosen.below(photos))
     assert not (tmp_path / "out").exists()
 
 
@@ -203,6 +205,8 @@ def test_prompts_beside_the_photos_are_found_and_masks_are_made_anew_once_they_c
     (posed / "prompts.json").write_text("[1]")
     chosen = ChosenSource("sam2", ("prompts=prompts.json", "model=facebook/sam3")).below(posed)
     assert chosen.options == (f"prompts={posed / 'prompts.json'}", "model=facebook/sam3")
+    usual = ChosenSource("sam2", ("model=facebook/sam3",)).below(posed)
+    assert set(usual.options) == set(chosen.options)
     before = chosen.digest()
     assert before == chosen.digest()
     (posed / "prompts.json").write_text("[2]")

@@ -120,7 +120,7 @@ def test_spin_nerf_masks_every_photo_that_has_one(fern, tmp_path, capsys):
     assert [mask is not None for mask in found] == [True, True, False]  # 4026 and 4027; 4034 has none
     (masks / "fern/IMG_9999.png").write_bytes((masks / "fern/IMG_4026.png").read_bytes())
     truth("--data", fern, "--spin-nerf", masks / "fern", "--object", "plant", "--overwrite")
-    assert "1 masks of other photos are left out (IMG_9999, ...)" in " ".join(capsys.readouterr().out.split())
+    assert "1 mask of other photos is left out (IMG_9999)." in " ".join(capsys.readouterr().out.split())
 
 
 MISSING = {  # paths to remove from NVOS's folder, and the sentence about each

@@ -19,7 +19,7 @@ from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView, ObjectMetrics, SceneMetrics
 from beags_plugin.evaluation.report import RunMetrics
 from beags_plugin.evaluation.run_metrics import evaluate_scene
-from beags_plugin.evaluation.table import render_run, summary_json
+from beags_plugin.evaluation.table import protocol_line, render_run, summary_json
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
 
@@ -192,3 +192,20 @@ def test_the_table_shows_both_stages():
         "Protocol: extracted masks against whole occlusion-free",
     ):
         assert part in out.getvalue()
+
+
+def test_without_scored_masks_there_is_no_protocol_of_masks():
+    """The sentences on images stay where there are such figures."""
+    nothing = ObjectMetrics(None, None)
+    images = SceneMetrics(nothing, {1: nothing}, 30.0, None, psnr_shown=31.0, shown=0.9, colors_fitted=True)
+    for after, ending in (
+        (images, "dB: 31.00\nPSNR shown: over the pixels"),
+        (replace(images, psnr_shown=None, shown=None), "dB: 30.00\n"),
+    ):
+        out = io.StringIO()
+        run = replace(report(), before=None, after=after)
+        Console(file=out, width=1000).print(render_run(run))
+        text = "\n".join(line.strip() for line in out.getvalue().splitlines()) + "\n"
+        assert "Protocol" not in text and "masks" not in text and ending in text
+        assert ("PSNR shown is taken after the colour fit" in text) == (after is images)
+    assert "silhouettes" in protocol_line([report(), replace(report(), after=images)])

@@ -45,7 +45,7 @@ def test_exchanged_ids_are_found_with_the_view(tmp_path):
     assert {issue.views for issue in found["swapped ids"]} == {("v03",), ("v09",)}
     pair = next(issue for issue in found["swapped ids"] if issue.views == ("v03",))
     assert "2 (right) instead of 1 (left), 1 (left) instead of 2 (right)" in pair.message
-    assert f"1 masks ({tmp_path / 'masks/v03.png'})" in pair.message
+    assert f"1 mask ({tmp_path / 'masks/v03.png'})" in pair.message
     pixels = int(np.isin(balls_from(poses()[3]), (1, 2)).sum())
     assert f"{pixels} pixels" in pair.cost
     assert set(found) == {"swapped ids"}
@@ -129,7 +129,7 @@ def test_mistakes_in_files_name_file_and_remedy(tmp_path):
     assert str(root / "masks/v02.png") in found["size"][0].message and "48x24" in found["size"][0].message
     assert str(root / "masks/v03.png") in found["type"][0].message and "has colours" in found["type"][0].message
     unknown = found["unknown id"][0].message
-    assert "id 255 is in 1 masks" in unknown and "--ignore-ids 255" in unknown
+    assert "id 255 is in 1 mask," in unknown and "--ignore-ids 255" in unknown
     assert found["missing"][0].views == ("v04",) and "1 of 10" in found["missing"][0].message
     assert "other.png" in found["unused"][0].message and "3 (top)" in found["unused name"][0].message
     levels = {kind: found[kind][0].level for kind in ("size", "type", "unknown id", "missing", "unused", "unused name")}
@@ -155,7 +155,7 @@ def test_the_command_writes_its_report_and_ends_with_1_on_errors(tmp_path, capsy
     assert report["coverage"][0]["pixels"]["1"] == int((balls_from(poses()[0]) == 1).sum())
     assert (tmp_path / "outputs/masks_check/scene/coverage.png").stat().st_size > 5000
     out = capsys.readouterr().out
-    assert words in out and "3 objects; 1 errors" in out
+    assert words in out and "3 objects; 1 error, " in out
 
 
 @pytest.mark.filterwarnings("error:Attempting to set identical")

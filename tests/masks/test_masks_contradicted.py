@@ -46,8 +46,10 @@ def test_views_that_cut_or_add_parts_are_named_by_the_points_that_they_saw(tmp_p
     main(check)
     out = " ".join(capsys.readouterr().out.split())
     assert "Views were compared at " in out and "2 warnings" in out
-    assert re.search(r"1 of 12 masks of 1 \(left\) contradict .* worst first: v03 leaves out \d\d % of \d+ points", out)
-    assert re.search(r"1 of 12 masks of 2 \(right\) contradict .* worst first: v07 takes in \d\d % of \d+ points", out)
+    assert re.search(
+        r"1 of 12 masks of 1 \(left\) contradicts .* worst first: v03 leaves out \d\d % of \d+ points", out
+    )
+    assert re.search(r"1 of 12 masks of 2 \(right\) contradicts .* worst first: v07 takes in \d\d % of \d+ points", out)
     found = json.loads((tmp_path / "out/report.json").read_text())["contradictions"]
     assert {(one["view"], one["class_id"], one["of"]) for one in found} == {("v03", 1, "points"), ("v07", 2, "points")}
     with Image.open(tmp_path / "out/contradicted.png") as picture:
@@ -140,7 +142,7 @@ def test_areas_that_a_run_contradicts_are_reported_with_their_cost(tmp_path):
     assert (one.view, one.class_id, one.missing, one.extra) == ("v03", 2, 0, area.pixels)
     assert one.total == area.pixels + (good[3] == 2).sum()
     (issue,) = [issue for issue in report.issues if issue.kind == "contradicted"]
-    assert "1 of 12 masks of 2 (right) contradict the other views at the run's depths" in issue.message
+    assert "1 of 12 masks of 2 (right) contradicts the other views at the run's depths" in issue.message
     assert issue.views == ("v03",) and issue.cost.startswith(f"{area.pixels} pixels ({percent(area.pixels, one.total)}")
     assert write_contradictions(report, tmp_path / "out")[0].is_file()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -283,6 +284,42 @@ def test_a_text_needs_no_other_weights_with_sam3_and_a_detector_with_sam2(sam2, 
         assert len(made(tmp_path, photos, objects, threshold=0.0, strict=0.0, **options)[1]) == FRAMES
     with pytest.raises(UserError, match="the weights IDEA-Research/grounding-dino-tiny cannot be loaded"):
         made(tmp_path, photos, objects, model=str(sam2))
+
+
+def test_prompts_and_the_weights_of_both_models_are_checked_before_masks_are_made(sam2, dino, tmp_path):
+    source = Sam2Source(prompts=tmp_path / "prompts.json", model=str(sam2), detector="/none/such", local=True)
+    with pytest.raises(UserError, match=r"prompts\.json cannot be read"):
+        source.check()
+    source.prompts.write_text(json.dumps({"objects": [{"name": "cup", "text": "red cup"}]}))
+    with pytest.raises(UserError, match="there is no folder /none/such"):
+        source.check()
+    replace(source, detector=str(dino)).check()
+
+
+def test_without_a_network_the_sentence_comes_at_once(tmp_path, monkeypatch, caplog):
+    """The hub's client would try for half a minute, and print a line for each try."""
+    import huggingface_hub
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
+    huggingface_hub.close_session()
+    begin = time.monotonic()
+    with pytest.raises(
+        UserError, match=r"no connection to http://127\.0\.0\.1:9\): name a folder that holds them, or go"
+    ):
+        classes("nobody/nothing", TRACKERS, "video model")
+    assert time.monotonic() - begin < 8 and not caplog.records
+
+
+def test_weights_of_the_hub_are_asked_for_only_if_they_are_not_here(sam2, monkeypatch):
+    read, asked = transformers.PretrainedConfig.get_config_dict, []
+
+    def stored(name, **options):
+        asked.append(options.get("local_files_only", False))
+        return read(sam2, **options)
+
+    monkeypatch.setattr(transformers.PretrainedConfig, "get_config_dict", stored)
+    assert classes("nobody/nothing", TRACKERS, "video model")[0] is transformers.Sam2VideoModel and asked == [True]
 
 
 def test_the_parts_of_sam3_are_loaded_from_its_weights(sam3):

@@ -109,6 +109,21 @@ def test_a_sheet_has_full_lines_and_no_empty_cell(tmp_path, masked):
         assert np.array_equal(np.asarray(picture), sheet)
 
 
+@pytest.mark.parametrize("masks", [0, 1])
+@pytest.mark.parametrize("count", [0, 1, 2, 4])
+@pytest.mark.parametrize("stages", [{"before": 0.3, "after": 0.6}, {"before": 0.3}])
+def test_lines_are_full_however_few_views_are_held_out(count, masks, stages):
+    held_out = views(full=8)[:count]
+    held_out[:masks] = [replace(view, visible=torch.ones(64, 64, dtype=torch.int64)) for view in held_out[:masks]]
+    objects = {1: {stage: ball(grey) for stage, grey in stages.items()}}
+    sheet = contact_sheet(held_out, photos(), ball(), objects, {1: "ball"}, BALLS)
+    white = (sheet == 255).all(axis=-1)
+    edge = white[:, -3 * GAP : -2 * GAP].all(axis=1)
+    assert edge.mean() < 0.15  # captions and gaps
+    assert np.diff(np.flatnonzero(~edge)).max() < 40
+    assert sheet.shape[1] <= COLUMNS * (LARGEST + GAP) and sheet.shape[0] < 1.6 * sheet.shape[1]
+
+
 def test_an_object_fills_two_lines_and_has_the_pixels_of_the_photos_files():
     held_out = views(full=6)
     sheet = object_cells(1, "ball", {"before": ball(), "after": ball(0.2)}, held_out, photos(), BALLS)
@@ -145,7 +160,7 @@ def test_photos_are_as_wide_as_the_cells_of_objects():
     upright = [replace(each, camera=replace(each.camera, width=wide, height=high)) for each in upright]
     for shown in (held_out, upright):
         sheet = contact_sheet(shown, photos(), ball(), {1: {"before": ball(), "after": ball(0.2)}}, {}, BALLS)
-        assert sheet.shape[1] == COLUMNS * (SMALLEST + GAP) + GAP
+        assert sheet.shape[1] == COLUMNS * (SMALLEST + GAP)
         lines = sheet[18 : 18 + SMALLEST], sheet[-GAP - SMALLEST : -GAP]
         assert all((line[:, -3 * GAP : -2 * GAP] < 255).any() for line in lines)
 
@@ -157,7 +172,8 @@ def _colours(row: np.ndarray) -> bytes:
 
 def test_a_small_object_is_enlarged_and_a_large_one_reduced():
     for full, size in ((1, SMALLEST), (12, LARGEST)):
-        sheet = object_cells(1, "ball", {"after": ball()}, views(full=full), photos(), BALLS)
+        stages = {"before": ball(), "after": ball()}
+        sheet = object_cells(1, "ball", stages, views(full=full), photos(), BALLS)
         assert sheet.shape[0] % (size + 18 + GAP) == 0, full
 
 

@@ -204,7 +204,7 @@ def test_groups_blur_repeats_and_kinds_of_photos_get_a_sentence_each(tmp_path):
     shutil.copy(photos / "a02.png", photos / "a02x.png")
     report, _ = process(photos, tmp_path / "scene", quiet)
     said = "\n".join(report.notes)
-    assert "a04x.png look blurred" in said and "a02x.png show the same" in said
+    assert "a04x.png looks blurred" in said and "a02x.png shows the same" in said
     assert "portrait" in said and report.cameras == 2
     assert "groups of" in said and report.groups[1] == 6
     lenses = [frame["w"] for frame in json.loads((tmp_path / "scene/transforms.json").read_text())["frames"]]

@@ -8,6 +8,7 @@ from beags_plugin.data.dataset import Dataset, Split
 from beags_plugin.data.files import choose_images, image_folders, list_images
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.llff import lacks_poses, model_or_bounds
+from beags_plugin.system.wording import amount, verb
 
 LABELS = "label"
 
@@ -36,7 +37,8 @@ class SpinNerf(Layout):
         labelled = [stem for stem in stems if (labels / f"{stem}.png").is_file()]
         gone = stems[: stems.index(labelled[0])] if labelled and set(stems[-len(labelled) :]) == set(labelled) else []
         poses, points = model_or_bounds(root, folder)
-        note = f"{len(gone)} images before the first label are left out: the object is gone there."
+        note, are = amount(len(gone), "image"), verb(len(gone), "are")
+        note += f" before the first label {are} left out: the object is gone there."
         return Dataset(
             self.title,
             root,

@@ -11,6 +11,7 @@ import numpy as np
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.masks.check.consistency import Agreement, band
 from beags_plugin.masks.check.issues import Issue, named, percent
+from beags_plugin.system.wording import amount, verb
 
 LEAST_OTHERS = 2  # least other views that see a point of a track; most tracks are short
 LEAST = 4  # least contradicted points of an object in a view
@@ -100,7 +101,8 @@ def issues_of(found: Sequence[Contradiction], names: Mapping[int, str], masks: i
             witnesses = "the other views at the run's depths"
             cost = f"{wrong} pixels ({percent(wrong, total)} of it in these views) go to another class in reprojection"
         message = (
-            f"{len(of)} of {masks} masks of {class_id} ({names[class_id]}) contradict {witnesses}, worst first: "
+            f"{len(of)} of {amount(masks, 'mask')} of {class_id} ({names[class_id]}) {verb(len(of), 'contradict')} "
+            f"{witnesses}, worst first: "
             f"{named(of)}; correct them where contradicted.png shows it, or remove them (a view without a mask does "
             "not vote)."
         )

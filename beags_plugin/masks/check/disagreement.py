@@ -9,6 +9,7 @@ import numpy as np
 from beags_plugin.masks.check.consistency import AGREEMENT, LEAST_POINTS, MOST, UNSEEN, Agreement
 from beags_plugin.masks.check.files import Coverage, MaskFiles
 from beags_plugin.masks.check.issues import Issue, named, percent
+from beags_plugin.system.wording import amount, verb
 
 HARDLY = 0.1  # least pixels of an object in a view that shows it, as a share of the most that any view has
 
@@ -41,8 +42,10 @@ def views_against_others(
             inverted = any(0 in pair for pair in pairs)
             kind = "inverted" if inverted else "swapped ids"
             says = ", ".join(f"{titles[new]} instead of {titles[true]}" for true, new in pairs)
-            remedy = "invert these masks." if inverted else "give these objects the ids of the other views."
-            message = f"{len(views)} masks ({files.paths(views)}) say {says}, against the other views: {remedy}"
+            these = "this mask" if len(views) == 1 else "these masks"
+            remedy = f"invert {these}." if inverted else "give these objects the ids of the other views."
+            masks, say = amount(len(views), "mask"), verb(len(views), "say")
+            message = f"{masks} ({files.paths(views)}) {say} {says}, against the other views: {remedy}"
         issues.append(Issue("warning", kind, message, cost, tuple(files.stems[view] for view in views)))
     return issues
 

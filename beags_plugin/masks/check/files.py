@@ -17,6 +17,7 @@ from beags_plugin.labels.id_checks import check_ids, check_palettes
 from beags_plugin.masks.check.issues import STOPS, Issue, named, percent
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.pasted import command
+from beags_plugin.system.wording import amount, verb
 
 FEW_VIEWS = 3  # least views of an object: two are needed to outvote one
 MOST_IDS = 256  # most ids in a file, and in a comparison of views, whose memory grows with their square
@@ -205,8 +206,9 @@ def _strays(files: MaskFiles) -> Iterator[Issue]:
         yield Issue(
             "warning",
             "unused",
-            f"{len(others)} files in {files.folder} are not used ({named([path.name for path in others], 3)}), as "
-            f"{why}: rename them after their images or save them as .png; those of photos without a pose may stay.",
+            f"{amount(len(others), 'file')} in {files.folder} {verb(len(others), 'are')} not used "
+            f"({named([path.name for path in others], 3)}), as {why}: rename them after their "
+            "images or save them as .png; those of photos without a pose may stay.",
             "training does not use them",
         )
 
@@ -224,7 +226,7 @@ def _names(files: MaskFiles, coverage: Coverage) -> Iterator[Issue]:
         yield Issue(
             "error",
             "unknown id",
-            f"id {class_id} is in {len(views)} masks, the first {files.masks[views[0]]}, but not in "
+            f"id {class_id} is in {amount(len(views), 'mask')}, the first {files.masks[views[0]]}, but not in "
             f"{files.names_file}: name it there or correct the masks{unlabelled}.",
             f"{STOPS}; the id covers {pixels} pixels ({percent(pixels, coverage.size.sum())})",
             tuple(files.stems[int(view)] for view in views),

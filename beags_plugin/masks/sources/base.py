@@ -157,7 +157,7 @@ class MaskSource(ABC):
         return None
 
     def check(self) -> None:  # noqa: B027  (most sources need no weights)
-        """Raise ``UserError``, before other work is done, if the weights that the options name are not available."""
+        """Raise ``UserError``, before other work, if files or weights that the options name are not available."""
 
     @abstractmethod
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:

@@ -15,6 +15,7 @@ from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progre
 from beags_plugin.masks.sources.matching import files_by_name
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.images import read_image
+from beags_plugin.system.wording import amount
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class IdImagesSource(MaskSource):
                 views.update(i for i in present.tolist() if i not in (0, IGNORE))
         used = {i for i, count in views.items() if count >= self.least_views}
         names = read_classes(None if self.names is None else scene.below(self.names), sorted(used))
-        notes = [f"{len(views) - len(used)} ids in fewer than {self.least_views} views became background."]
+        notes = [f"{amount(len(views) - len(used), 'id')} in fewer than {self.least_views} views became background."]
 
         def read(photo: Photo) -> np.ndarray | None:
             if photo.name not in files:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from beags_plugin.masks.sources.base import MadeMasks, MaskSource, Photo, Progress, SourceScene
-from beags_plugin.masks.sources.prompts import Prompt, read_prompts
+from beags_plugin.masks.sources.prompts import Prompt, PromptedObject, read_prompts
 from beags_plugin.masks.sources.two_stage import BestLabels, Box, retrieve
 from beags_plugin.system.errors import UserError
 
@@ -60,11 +60,23 @@ class Sam2Source(MaskSource):
         return None
 
     def check(self) -> None:
+        objects = read_prompts(self.prompts)
         self._trackers()
+        self._detectors(objects)
 
     def _trackers(self) -> list[Any]:
         """Return the library's classes for the model and its processor."""
         return classes(self.model, TRACKERS, "video model of SAM 2 or SAM 3", self.local)
+
+    def _detectors(self, objects: Sequence[PromptedObject]) -> tuple[str, list[Any]] | None:
+        """Return the name of the detector, and the library's classes for it and its processor; None without texts."""
+        if not any(one.text for one in objects):
+            return None
+        finder = self.detector
+        if finder == "auto":
+            finds = model_type(self.model, self.local) in DETECTORS
+            finder = self.model if finds else "IDEA-Research/grounding-dino-tiny"
+        return finder, classes(finder, DETECTORS, "detector of texts", self.local)
 
     def make(self, scene: SourceScene, progress: Progress) -> MadeMasks:
         path = scene.below(self.prompts)
@@ -76,14 +88,11 @@ class Sam2Source(MaskSource):
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
         trackers = self._trackers()
-        finder, detectors = self.detector, []
-        if any(one.text for one in objects):
-            if finder == "auto":
-                finds = model_type(self.model, self.local) in DETECTORS
-                finder = self.model if finds else "IDEA-Research/grounding-dino-tiny"
-            detectors = classes(finder, DETECTORS, "detector of texts", self.local)
+        detectors = self._detectors(objects)
         tracker = load(self.model, trackers, self.local)
-        detector = TextDetector(*load(finder, detectors, self.local), photos, device) if detectors else None
+        detector = None
+        if detectors is not None:
+            detector = TextDetector(*load(*detectors, self.local), photos, device)
         names = {0: "background", **{one.class_id: one.name for one in objects}}
         notes: list[str] = []
 
@@ -110,10 +119,27 @@ def model_type(name: str, local: bool = False) -> str:
 
     if not (Path(name).is_dir() or re.fullmatch(r"[\w.-]+(/[\w.-]+)?", name)):
         raise UserError(f"there is no folder {name}: name one that holds the weights, or a model of the hub.")
+    read = transformers.PretrainedConfig.get_config_dict
     try:
-        return str(transformers.PretrainedConfig.get_config_dict(name, local_files_only=local)[0].get("model_type"))
+        try:
+            return str(read(name, local_files_only=True)[0].get("model_type"))
+        except OSError:
+            if local or Path(name).is_dir():
+                raise
+        _reach_hub()  # The library itself would try for half a minute.
+        return str(read(name)[0].get("model_type"))
     except (OSError, ValueError) as error:
         raise _not_loaded(name, error) from error
+
+
+def _reach_hub() -> None:
+    """Raise ``ConnectionError`` if the hub does not answer."""
+    from huggingface_hub import constants, get_session  # pyright: ignore[reportMissingImports]
+
+    try:
+        get_session().head(constants.ENDPOINT, timeout=10)
+    except Exception as error:  # Which library speaks HTTP depends on the client's version.
+        raise ConnectionError(f"no connection to {constants.ENDPOINT}") from error
 
 
 def classes(name: str, kinds: Mapping[str, tuple[str, str]], what: str, local: bool = False) -> list[Any]:

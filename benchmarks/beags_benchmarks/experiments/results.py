@@ -113,7 +113,7 @@ def means(rows: Sequence[ResultRow]) -> list[ResultRow]:
 
 
 def protocol_of(rows: Sequence[ResultRow]) -> str | None:
-    """Return the sentence of ``beags eval`` with all choices behind the figures of rows; None if all failed.
+    """Return the sentences of ``beags eval`` with all choices behind the figures of rows; None if all failed.
 
     Trials of one bench have one protocol.
     """
