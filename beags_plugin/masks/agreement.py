@@ -8,9 +8,13 @@ L_vic that Gaussian i gives to the pixels of view v that its mask labels c, and 
     e_v = sum_{i, c != c_i} L_vic / sum_{i, c or c_i an object} L_vic,   a_v = 1 / (1 + (e_v / median e)^2),
 
 and 0 where e_v exceeds ``SILENT``; both settle in a few rounds. A view whose mask shows no object starts with weight 0,
-because a network that found nothing there may have missed the object. Each object's cut has the unary terms
+because a network that found nothing there may have missed the object; it has no e_v if the others see none there either
+(NaN), so that empty views are no sign of agreement. Each object's cut has the unary terms
 0.3 logit p_ic, and the links of ``picking.graph``, which are cheap to cut along creases, depth edges and changes of
 colour.
+
+Where the pose of a view is wrong, its mask fits its photo, but contradicts the Gaussians. Such a mask is recognised by
+a shift in the image after which it fits, and it is not redrawn.
 """
 
 from __future__ import annotations
@@ -34,11 +38,15 @@ from beags_plugin.rasterizers.rendering import draw_features, geometry_inputs
 
 ROUNDS = 4  # rounds in which weights are computed from errors, and errors from weighted votes
 LEAST_ERROR = 0.02  # lower bound of the median e: outlines alone cause as much
+TRACE = 0.01  # share of the objects' light in the median view up to which a view only has their glow at its border
 SILENT = 0.5  # largest e of a mask with weight: one that is more wrong than right is redrawn from the other views
 CONTRADICTS = 1.5  # e, in medians, up to which a mask keeps all its pixels, as Gaussians are coarser than photos
 BELIEF, LIMIT = 0.3, 0.02  # weight of logit p beside links of at most 1; bound of p that keeps its logit finite
 NO_VOTE = 0.4  # prior votes for the object, out of 1: a Gaussian without votes is more likely background
 SURE = 0.15  # least p - 1/2 at which votes alone make a class certain
+FITS, NEAR = 0.8, 1 / 3  # least IoU of a misplaced view's mask with what is drawn, after and before the shift
+LESS = 2 / 3  # largest share of the former 1 - IoU that remains after the shift
+SMALL = 256  # longer side of the masks in which the shift is searched, pixels
 DRAWN = 0.5  # least share of a pixel's light that a class needs to label it
 
 Progress = Callable[[int, int], None]
@@ -49,8 +57,8 @@ class Agreement:
     """The decisions on N Gaussians by the masks of V views.
 
     class_ids: [N] int32. sure: [N] bool, where the votes clearly support the cut. errors: [V] float64, e_v; NaN without
-    a mask. weights: [V] float64, a_v; 0 for a view that is silenced or shows no object. light: [N] float64, the
-    weighted light over all classes.
+    a mask, and where neither the mask nor the other views show an object. weights: [V] float64, a_v; 0 for a view that
+    is silenced or shows no object. light: [N] float64, the weighted light over all classes.
     """
 
     class_ids: Tensor
@@ -66,8 +74,8 @@ class Agreement:
 
     @property
     def silenced(self) -> list[int]:
-        """Return the views with a mask of weight 0, ascending."""
-        return [int(view) for view in np.flatnonzero((self.weights == 0) & ~np.isnan(self.errors))]
+        """Return the views with a mask that is more wrong than right, ascending."""
+        return [int(view) for view in np.flatnonzero(self.errors > SILENT)]
 
 
 @dataclass(frozen=True)
@@ -75,12 +83,13 @@ class AgreedMask:
     """The labels of a view [H, W] int32 after agreement: class ids or IGNORE.
 
     changed: [H, W] bool, pixels whose class differs from the given one. doubtful: [H, W] bool, pixels left unlabelled
-    because no class is certain.
+    because no class is certain. misplaced: the pose of the view, not its mask, contradicts the other views.
     """
 
     labels: Tensor
     changed: Tensor
     doubtful: Tensor
+    misplaced: bool = False
 
 
 def decide(
@@ -159,18 +168,20 @@ class _Votes:
         return total.reshape(self._count, self._classes)
 
     def errors(self, sums: np.ndarray) -> np.ndarray:
-        """Return e, [V] float64; NaN without a mask, and 0 where neither the view nor the others see an object."""
+        """Return e, [V] float64; NaN without a mask, and where neither the view nor the others see an object."""
         agreed, known = sums.argmax(axis=1), sums.sum(axis=1) > 0
-        errors = np.full(len(self._views), np.nan)
+        wrong, seen = np.zeros(len(self._views)), np.zeros(len(self._views))
         for index, view in enumerate(self._views):
             if view is None:
                 continue
             keys, light = view
             gaussians, classes = keys // self._classes, keys % self._classes
             of_objects = known[gaussians] & ((classes != BACKGROUND) | (agreed[gaussians] != BACKGROUND))
-            wrong = of_objects & (classes != agreed[gaussians])
-            errors[index] = float(light[wrong].sum()) / max(float(light[of_objects].sum()), 1e-12)
-        return errors
+            seen[index] = float(light[of_objects].sum())
+            wrong[index] = float(light[of_objects & (classes != agreed[gaussians])].sum())
+        trace = TRACE * float(np.median(seen[self.shows_object])) if self.shows_object.any() else 0.0
+        least = np.where(self.shows_object, 0.0, trace)
+        return np.divide(wrong, seen, out=np.full(len(seen), np.nan), where=seen > least)
 
     def weights(self, errors: np.ndarray) -> np.ndarray:
         """Return a, [V] float64."""
@@ -193,8 +204,9 @@ def agreed_masks(
 
     A given outline is finer than that of Gaussians, so only differences wider than 2 ``reach`` pixels count. There a
     pixel takes the class of the Gaussians if these are certain, else IGNORE. Masks of silenced views, and of views
-    without one, are redrawn whole. reach: 1 at the size of the training, more at larger photos. photos: per view a
-    function that returns the photo [H, W, 3] uint8 RGB; new outlines move to its edges. None: they stay.
+    without one, are redrawn whole. Masks of misplaced views stay, but for all differences, which become IGNORE.
+    reach: 1 at the size of the training, more at larger photos. photos: per view a function that returns the photo
+    [H, W, 3] uint8 RGB; new outlines move to its edges. None: they stay.
     """
     inputs = geometry_inputs(surfels)
     ids, sure = (each.to(inputs.means.device) for each in (agreement.class_ids, agreement.sure))
@@ -211,6 +223,10 @@ def agreed_masks(
         of_classes, certain = light[..., :-1], light[..., -1] > DRAWN
         rendered = np.where(of_classes.max(axis=-1) > DRAWN, of_classes.argmax(axis=-1), IGNORE)
         given = np.full(rendered.shape, IGNORE, np.int64) if mask is None else mask.cpu().numpy().astype(np.int64)
+        if mask is not None and is_shifted(given, rendered):
+            doubtful = torch.from_numpy((rendered != given) & (given != IGNORE)).to(mask.device)
+            yield AgreedMask(mask.masked_fill(doubtful, IGNORE), torch.zeros_like(doubtful), doubtful, misplaced=True)
+            continue
         if mask is None or view in whole:
             redrawn = np.ones(rendered.shape, dtype=bool)
         else:
@@ -224,6 +240,27 @@ def agreed_masks(
         doubtful = torch.from_numpy(redrawn & (labelled == IGNORE))
         changed = torch.from_numpy((labelled != given) & (labelled != IGNORE))
         yield AgreedMask(new.to(inputs.means.device), changed, doubtful)
+
+
+def is_shifted(given: np.ndarray, rendered: np.ndarray) -> bool:
+    """Return whether the objects of given labels [H, W] fit rendered ones after a shift, and much better than without.
+
+    Neither an object that a mask lacks nor a part that it takes in too much goes away by a shift.
+    """
+    import cv2
+
+    scale = min(SMALL / max(given.shape), 1.0)
+    size = (max(round(scale * given.shape[1]), 1), max(round(scale * given.shape[0]), 1))
+    first, second = (
+        cv2.resize(np.where((each != IGNORE) & (each != BACKGROUND), 1.0, 0.0), size, interpolation=cv2.INTER_AREA)
+        for each in (given, rendered)
+    )
+    padded = (2 * size[1], 2 * size[0])  # A shift moves nothing over the border to the other side.
+    product = np.fft.rfft2(first, padded) * np.fft.rfft2(second, padded).conj()
+    common = np.fft.irfft2(product, padded)  # pixels that both have in common after each shift
+    total = max(float(first.sum() + second.sum()), 1e-12)
+    before, after = (float(each) / max(total - float(each), 1e-12) for each in (common[0, 0], common.max()))
+    return after > FITS and before > NEAR and 1.0 - after < LESS * (1.0 - before)
 
 
 def _wide(mask: np.ndarray, reach: int) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -26,9 +26,10 @@ class AgreementReport:
     """What agreement did to the masks of V views.
 
     errors: [V], share on which a view contradicts the others, of the pixels that either calls an object; None without
-    a mask. overruled: views whose masks have no vote, or show nothing. changed, doubtful: [V], shares of pixels that
-    got another class, and that were left unlabelled. things: the parts that one object was split into; None if it was
-    not.
+    a mask, and where neither does. overruled: views whose masks are more wrong than right and were redrawn whole.
+    changed, doubtful: [V], shares of pixels that got another class, and that were left unlabelled. things: the parts
+    that one object was split into; None if it was not. misplaced: views whose masks stayed, because their poses rather
+    than these contradict the others.
     """
 
     errors: list[float | None]
@@ -36,27 +37,29 @@ class AgreementReport:
     changed: list[float]
     doubtful: list[float]
     things: Things | None = None
+    misplaced: list[int] = field(default_factory=list)
 
     @property
     def agreement(self) -> float:
-        """Return the mean share of the objects on which a view and the others agree, 0..1; 1 without a mask."""
+        """Return the mean share of the objects on which a view and the others agree, 0..1; 1 without an object."""
         known = [1.0 - error for error in self.errors if error is not None]
         return float(np.mean(known)) if known else 1.0
 
     def of_first(self, count: int) -> AgreementReport:
         """Return what it did to the first ``count`` views."""
-        first = slice(count)
-        overruled = [view for view in self.overruled if view < count]
-        return AgreementReport(self.errors[first], overruled, self.changed[first], self.doubtful[first], self.things)
+        overruled, misplaced = ([view for view in views if view < count] for views in (self.overruled, self.misplaced))
+        errors, changed, doubtful = self.errors[:count], self.changed[:count], self.doubtful[:count]
+        return AgreementReport(errors, overruled, changed, doubtful, self.things, misplaced)
 
     def to_json(self, names: Sequence[str]) -> dict[str, Any]:
-        """Return plain values for JSON; names: of the views."""
+        """Return plain values for JSON; names: of the views. "masks" counts those that have an error."""
         rows = zip(names, self.errors, self.changed, self.doubtful, strict=True)
         return {
             **({} if self.things is None else {"things": asdict(self.things)}),
             "agreement": round(self.agreement, 4),
             "masks": sum(error is not None for error in self.errors),
             "overruled": [names[view] for view in self.overruled],
+            "misplaced": [names[view] for view in self.misplaced],
             "changed": round(float(np.mean(self.changed)), 5),
             "doubtful": round(float(np.mean(self.doubtful)), 5),
             "views": [
@@ -71,12 +74,18 @@ class AgreementReport:
         line = f"the views agree on {100 * self.agreement:.0f} % of what they call an object"
         if self.overruled:
             line += f"; {len(self.overruled)} of {count} masks were overruled as a whole"
-            if names is not None:
-                rest = len(self.overruled) - NAMED
-                line += f" ({', '.join(names[view] for view in self.overruled[:NAMED])}"
-                line += f" and {rest} more)" if rest > 0 else ")"
+            line += "" if names is None else _named(self.overruled, names)
+        if self.misplaced:
+            line += f"; {len(self.misplaced)} of {count} masks do not fit because the poses of their photos are wrong"
+            line += "" if names is None else _named(self.misplaced, names)
         changed, doubtful = (100 * float(np.mean(share)) for share in (self.changed, self.doubtful))
         return f"{line}; {changed:.2f} % of all pixels got another class, {doubtful:.2f} % are in doubt and left out"
+
+
+def _named(views: Sequence[int], names: Sequence[str]) -> str:
+    """Return the names of the first of these views, in brackets."""
+    rest = len(views) - NAMED
+    return f" ({', '.join(names[view] for view in views[:NAMED])}{f' and {rest} more' if rest > 0 else ''})"
 
 
 def agree(
@@ -106,7 +115,7 @@ def agree(
         split = separate(agreement, surfels, things)
         given = LabelMaps(separated_labels(split, surfels, cameras, given, rasterizer, settings))
         agreement, known = split.agreement, ClassRanks(torch.arange(split.things.found + 1))
-    ranked, changed, doubtful = LabelMaps(), [], []
+    ranked, changed, doubtful, misplaced = LabelMaps(), [], [], []
     with stage("Drawing agreed masks") as progress:
         masks = agreed_masks(agreement, surfels, cameras, given, rasterizer, settings, len(known), reach, photos)
         for view, mask in enumerate(masks):
@@ -114,8 +123,10 @@ def agree(
             ranked.append(mask.labels)
             changed.append(float(mask.changed.float().mean()) if given.stored[view] is not None else 0.0)
             doubtful.append(float(mask.doubtful.float().mean()))
+            misplaced += [view] if mask.misplaced else []
             if progress is not None:
                 progress(view + 1, len(cameras))
     errors = [None if np.isnan(error) else round(float(error), 4) for error in agreement.errors]
-    report = AgreementReport(errors, agreement.silenced, changed, doubtful, None if split is None else split.things)
+    overruled, found = sorted(set(agreement.silenced) - set(misplaced)), None if split is None else split.things
+    report = AgreementReport(errors, overruled, changed, doubtful, found, misplaced)
     return translated(ranked, known, known.class_ids), report

@@ -95,6 +95,18 @@ def reprojected_masks(
     return ConsistentMasks(ranked, translated(ranked, known, known.class_ids), confidence)
 
 
+def left_out(masks: ConsistentMasks, doubtful: CompressedMaps, known: ClassRanks) -> ConsistentMasks:
+    """Return the masks without labels and confidence where ``doubtful``, per view [H, W] uint8, is not 0."""
+
+    def cleared(maps: Sequence[Tensor], value: int) -> Iterator[Tensor]:
+        for each, doubt in zip(maps, doubtful, strict=True):
+            yield each.masked_fill(doubt.to(each.device) > 0, value)
+
+    ranked = LabelMaps(cleared(masks.ranked, IGNORE))
+    confidence = None if masks.confidence is None else CompressedMaps(cleared(masks.confidence, 0))
+    return ConsistentMasks(ranked, translated(ranked, known, known.class_ids), confidence)
+
+
 def translated(labels: LabelMaps, known: ClassRanks, table: Callable[[Tensor], Tensor]) -> LabelMaps:
     """Return the maps with ``table`` applied to all but IGNORE; the same maps if ranks are ids."""
     return labels if known.trivial else LabelMaps(None if mask is None else _translated(mask, table) for mask in labels)

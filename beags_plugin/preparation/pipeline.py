@@ -27,6 +27,7 @@ from beags_plugin.preparation.consistent_masks import (
     ConsistentMasks,
     Stage,
     chosen_reprojection,
+    left_out,
     masks_as_they_are,
     render_depths,
     reprojected_masks,
@@ -139,14 +140,18 @@ def prepare(
     summary: list[str] = []
     seconds: dict[str, float] = {}
 
-    agreement = None
+    agreement, doubtful = None, None
     if config.agree:
+        doubtful = CompressedMaps()
         with timed(seconds, "agreement"):
-            maps, agreement = agree(surfels, cameras, maps, known, rasterizer, settings, stage)
+            maps, agreement = agree(
+                surfels, cameras, maps, known, rasterizer, settings, stage,
+                take=lambda _, mask: doubtful.append(mask.doubtful.to(torch.uint8)),
+            )  # fmt: skip
             agreement = agreement.of_first(len(maps) if photos is None else photos)
         summary.append(f"agreement: {agreement.sentence()}")
     with timed(seconds, "reprojection"):
-        masks = _consistent_masks(surfels, cameras, maps, known, rasterizer, settings, config, stage, summary)
+        masks = _consistent_masks(surfels, cameras, maps, known, rasterizer, settings, config, stage, summary, doubtful)
     with timed(seconds, "assignment"), stage("Assigning classes") as progress:
         shares = contributions(surfels, cameras, masks.ranked, rasterizer, settings, len(known), progress=progress)
         shares = replace(shares, classes=known)
@@ -200,9 +205,12 @@ def check_masks(labels: Iterable[Tensor | None]) -> None:
 
 def _consistent_masks(
     surfels, cameras, maps: LabelMaps, known: ClassRanks, rasterizer, settings, config,
-    stage: Stage, summary: list[str],
+    stage: Stage, summary: list[str], doubtful: CompressedMaps | None,
 ) -> ConsistentMasks:  # fmt: skip
-    """Return the labels of all views, reprojected unless that is off, and add lines to ``summary``."""
+    """Return the labels of all views, reprojected unless that is off, and add lines to ``summary``.
+
+    doubtful: per view [H, W] uint8, 1 for pixels that reprojection leaves unlabelled; None: there are none.
+    """
     if config.reprojection == "none":
         summary.append("reprojection: off, masks used as they are")
         return masks_as_they_are(maps, cameras, known)
@@ -212,6 +220,8 @@ def _consistent_masks(
         depths = filed(rendered, surfels.means.device)
     with stage("Reprojecting masks") as progress:
         masks = reprojected_masks(depths, cameras, maps, known, replace(config, reprojection=method), progress)
+    if doubtful is not None:
+        masks = left_out(masks, doubtful, known)
     if why is not None:
         summary.append(why)
     summary.append(_reprojection_summary(maps, masks.labels))

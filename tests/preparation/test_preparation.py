@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 
 import pytest
@@ -14,6 +15,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import LabelMaps
 from beags_plugin.preparation import consistent_masks
+from beags_plugin.preparation.agreed import AgreementReport
 from beags_plugin.preparation.consistent_masks import chosen_reprojection
 from beags_plugin.preparation.pipeline import PreparationConfig, prepare
 from beags_plugin.rasterizers import make_rasterizer
@@ -26,31 +28,62 @@ CAMERA = Camera(torch.eye(4), torch.tensor([[10.0, 0.0, 6.0], [0.0, 10.0, 6.0], 
 
 
 def prepared(labels, **options):
-    """Equal cameras that look at one wide disc; labels: a class id for each whole view, or None."""
+    """Prepare equal cameras that look at one wide disc; labels: a class id for each whole view, a mask, or None."""
     wide = Surfels.of(
         torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 2), 1.0),
         torch.tensor([3.0]), torch.zeros(1, 1, 3),
     )  # fmt: skip
-    masks = [None if label is None else torch.full((SIZE, SIZE), label, dtype=torch.int32) for label in labels]
+    masks = [
+        torch.full((SIZE, SIZE), label, dtype=torch.int32) if isinstance(label, int) else label for label in labels
+    ]
     config = PreparationConfig(k=1, **options)
     names = {0: "background", 1: "one", 2: "two"}
     rasterizer, settings = make_rasterizer("torch"), RasterSettings(0.1, 100.0)
-    found = prepare(wide, [CAMERA] * len(masks), masks, names, rasterizer, settings, NoRefiner(), config)
+    return prepare(wide, [CAMERA] * len(masks), masks, names, rasterizer, settings, NoRefiner(), config)
+
+
+def classes_of(labels, **options):
+    """Return the classes in each view's mask."""
+    found = prepared(labels, **options)
     return [sorted(set(mask.unique().tolist())) for mask in found.labels]
 
 
 def test_all_views_vote():
-    assert prepared([1, 2, 2, 1, 2]) == [[2]] * 5
+    assert classes_of([1, 2, 2, 1, 2]) == [[2]] * 5
 
 
 def test_a_view_without_a_mask_gets_what_the_others_vote_and_in_a_tie_each_keeps_its_own():
-    assert prepared([1, None, 2, 2]) == [[2]] * 4
-    assert prepared([1, None, 2]) == [[1], [IGNORE], [2]]
+    assert classes_of([1, None, 2, 2]) == [[2]] * 4
+    assert classes_of([1, None, 2]) == [[1], [IGNORE], [2]]
 
 
 def test_a_mask_that_contradicts_the_others_is_overruled_where_agreement_is_asked_for():
-    assert prepared([1, 1, 1, 1, 2], reprojection="none") == [[1]] * 4 + [[2]]
-    assert prepared([1, 1, 1, 1, 2], reprojection="none", agree=True) == [[1]] * 5
+    assert classes_of([1, 1, 1, 1, 2], reprojection="none") == [[1]] * 4 + [[2]]
+    assert classes_of([1, 1, 1, 1, 2], reprojection="none", agree=True) == [[1]] * 5
+
+
+def test_pixels_in_doubt_stay_unlabelled_in_the_masks_that_training_uses():
+    """The others give the disc to class 2 in 7 of 12 columns, which is too little to be sure of it."""
+    halves = torch.ones(SIZE, SIZE, dtype=torch.int32)
+    halves[:, 5:] = 2
+    labels = [None, halves, halves, halves]
+    assert classes_of(labels) == [[1, 2]] * 4
+    found = prepared(labels, agree=True)
+    assert found.agreement is not None and found.agreement.doubtful == [1.0, 0.0, 0.0, 0.0]
+    assert found.confidence is not None and not found.confidence[0].any() and found.confidence[1].all()
+    assert [float((mask == IGNORE).float().mean()) for mask in found.labels] == found.agreement.doubtful
+
+
+def test_the_report_of_agreement_holds_no_nan_and_names_misplaced_views():
+    report = AgreementReport([0.25, None, 0.6, 0.3], [2], [0.0] * 4, [0.0, 0.0, 0.5, 0.1], None, [3])
+    written = json.loads(json.dumps(report.to_json(["a", "b", "c", "d"]), allow_nan=False))
+    assert written["agreement"] == pytest.approx(1 - 1.15 / 3, abs=1e-4) and written["masks"] == 3
+    assert written["overruled"] == ["c"] and written["misplaced"] == ["d"]
+    assert written["views"][1]["contradicts"] is None
+    first = report.of_first(3)
+    assert first.misplaced == [] and first.overruled == [2] and len(first.errors) == 3
+    assert "1 of 3 masks do not fit because the poses of their photos are wrong (d)" in report.sentence(list("abcd"))
+    assert "poses" not in first.sentence()
 
 
 @pytest.mark.parametrize(
