@@ -53,7 +53,7 @@ def certainty(
     level = "not judged" if agreement is None else _level(agreement)
     if agreement is not None:
         figures["agreement"] = {name: agreement[name] for name in ("agreement", "masks", "overruled", "doubtful")}
-        lines.append(_of_masks(level, agreement))
+        lines.append(_of_masks(level, agreement, left_out=apart is None))
     elif scene.mended:
         lines.append(
             "How sure: not judged, since you repainted some of the network's masks, so all are taken as they are."
@@ -99,14 +99,16 @@ def _far(agreement: dict[str, Any]) -> list[str]:
     return [each["view"] for each in agreement["views"] if (each["contradicts"] or 0.0) > FAR]
 
 
-def _of_masks(level: str, agreement: dict[str, Any]) -> str:
+def _of_masks(level: str, agreement: dict[str, Any], left_out: bool) -> str:
+    """Return how sure the result is. left_out: whether training left out pixels in doubt, not only votes on them."""
     line = f"How sure: {level}. The views agree on {100 * agreement['agreement']:.0f} % of what they call the object"
     masks, far = agreement["masks"], len(_far(agreement))
     if agreement["overruled"]:
         line += f"; {len(agreement['overruled'])} of {masks} masks were overruled as a whole"
     if far > SOME * masks:
         line += f"; {far} of {masks} contradict the others on more than {100 * FAR:.0f} %"
-    return f"{line}; {100 * agreement['doubtful']:.1f} % of all pixels are in doubt and were left out."
+    doubt = f"{100 * agreement['doubtful']:.1f} % of all pixels are in doubt"
+    return f"{line}; {doubt}{' and were left out' if left_out else ''}."
 
 
 def _without_poses(without: int, photos: int, names: list[str]) -> str:

@@ -136,6 +136,7 @@ def test_things_told_apart_are_judged_by_their_own_report_and_fewer_are_said(tmp
     (apart / "doubt.png").write_bytes(b"drawn")
     judged = certainty(run, MadeScene(tmp_path), "beags demo --data x", apart)
     assert judged.level == "sure" and judged.figures["things"]["found"] == found
+    assert judged.lines[0].endswith("0.4 % of all pixels are in doubt.")
     sentence = "Only 2 separate things were found, not 3: click on things that touch, or that most masks lack."
     assert (sentence in judged.lines) is said and "    beags demo --data x --pick --fresh" in judged.lines
     assert write_doubt(run, tmp_path / "doubt.png", apart) and (tmp_path / "doubt.png").read_bytes() == b"drawn"
