@@ -23,7 +23,7 @@ setup:
 PYTEST = BEAGS_REQUIRE_NATIVE=1 OMP_NUM_THREADS=1 "$(BIN)/python" -m pytest -q -n $(JOBS) --dist loadscope \
   --no-loadscope-reorder
 
-# Every room, in about six minutes on two cores.
+# Every room, in about four minutes on two idle cores.
 test: setup
 	$(PYTEST) -m "not slow"
 

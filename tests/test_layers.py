@@ -44,11 +44,8 @@ ROOMS = [
 ]
 ORDER = {room: place for place, rooms in enumerate(ROOMS) for room in rooms.split()}
 MODULES = {path.relative_to(PACKAGE).with_suffix("").as_posix(): path for path in PACKAGE.rglob("*.py")}
-TARGETS = {
-    "plugin/model",
-    "plugin/pipeline",
-    "plugin/trainer",
-}  # a config of nerfstudio's names what it sets up, above it
+CONFIGS = "plugin/options/"  # its configs, which are nerfstudio's, name what they set up, above them
+TARGETS = {"plugin/model", "plugin/pipeline", "plugin/trainer"}
 NERFSTUDIO = {"commands"}  # All rooms of plugin/ know it too.
 
 
@@ -106,8 +103,13 @@ def arrows() -> dict[str, set[str]]:
 
 def lazy_arrows() -> dict[str, set[str]]:
     """Every module and the modules of this package that its strings name, but for what nerfstudio's configs set up."""
-    found = {module: set(map(module_of, named_in_strings(path.read_text()))) for module, path in MODULES.items()}
-    return {module: {each for each in targets if each is not None} - TARGETS for module, targets in found.items()}
+    return {module: lazy_targets(module, path.read_text()) for module, path in MODULES.items()}
+
+
+def lazy_targets(module: str, source: str) -> set[str]:
+    """The modules of this package that the strings of one module name, but for those that its configs set up."""
+    named = {each for each in map(module_of, named_in_strings(source)) if each is not None}
+    return named - TARGETS if module.startswith(CONFIGS) else named
 
 
 def upward(links: dict[str, set[str]]) -> list[str]:
@@ -160,6 +162,9 @@ def test_the_check_sees_what_it_should():
     assert {module_of(name) for name in imported(hidden)} == {"core/sh", "losses/__init__"}
     strings = 'load("beags_plugin.core.sh:rotated")\n"""See beags_plugin.core.cameras: Camera."""\n'
     assert [module_of(name) for name in named_in_strings(strings)] == ["core/sh"]
+    target = 'load("beags_plugin.plugin.model:BeagsModel")'
+    assert lazy_targets("plugin/options/config", target) == set()
+    assert upward({"core/sh": lazy_targets("core/sh", target)}), "only configs of nerfstudio may name what they set up"
 
 
 def test_every_file_lies_in_a_room():

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.lifting import TAU
+from beags_plugin.core.lifting import hides
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
@@ -68,7 +68,7 @@ class MaskedViews:
             with torch.no_grad():
                 render = self.rasterizer.rasterize(inputs, camera, settings, _black(part))
             own = labels == class_id
-            hidden = (scene > 0) & (scene < (1.0 - TAU) * surface_depth(render, "expected"))
+            hidden = hides(scene, surface_depth(render, "expected"))
             places = torch.full_like(labels, _OUTSIDE)
             places[hidden] = _HIDDEN
             places[_grown(own)] = _BESIDE

@@ -64,7 +64,7 @@ class Demo:
     """Options of the source, as key=value, e.g. model=isnet-general-use."""
 
     def run(self) -> None:
-        with starting(self):
+        with starting(self, nerfstudio=True):
             from beags_plugin.commands.demo import run_demo
         run_demo(
             self.data, self.output, self.preset, self.downscale, self.seed, self.fresh, self.strict, self.pick,
@@ -89,7 +89,7 @@ class Resume:
     """Refuse to begin if hardly any memory or disk is free; save and stop when memory runs out."""
 
     def run(self) -> None:
-        with starting(self):
+        with starting(self, nerfstudio=True):
             from beags_plugin.plugin.launch import resume
         try:
             resume(self.run_folder, self.device, self.check_memory, self.data)
@@ -116,7 +116,7 @@ class View:
     """With --save-to: the objects to be picked, under these names if they get no others."""
 
     def run(self) -> None:
-        with starting(self):
+        with starting(self, nerfstudio=True):
             from beags_plugin.plugin.viewer.errand import Errand
             from beags_plugin.plugin.viewer.serve import serve
         errand = None if self.save_to is None else Errand(self.save_to.absolute(), self.expect)

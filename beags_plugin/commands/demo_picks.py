@@ -115,6 +115,7 @@ def things_apart(scene: MadeScene, output: Path, base: Path, objects: int) -> Ma
     """
     from beags_plugin.objects.agree_masks import agree_masks
     from beags_plugin.objects.reproject_masks import ReprojectionOptions
+    from beags_plugin.runs.run import Run
 
     folder, given = output / APART, scene.labels or scene.data
     masks, stamp = folder / "masks", folder / APART_STAMP
@@ -128,7 +129,7 @@ def things_apart(scene: MadeScene, output: Path, base: Path, objects: int) -> Ma
     else:
         shutil.rmtree(folder, ignore_errors=True)
         options = ReprojectionOptions(given / "masks", given / "classes.json", run_size=True)
-        for line in agree_masks(base / "config.yml", options, folder, objects, enlarge=True):
+        for line in agree_masks(Run(base / "config.yml"), options, folder, objects, enlarge=True):
             CONSOLE.print(line)
         write_text_atomically(json.dumps({"of": made_of, "masks": folder_digest(masks)}), stamp)
     return replace(scene, labels=folder)

@@ -45,9 +45,11 @@ class Check:
             raise UserError("no scene is named: give --data its folder, or --load-config a run trained on it.")
         with starting(self):
             from beags_plugin.objects.check_masks import check, options_beside, write_report
+            from beags_plugin.runs.run import Run
+        run = None if self.load_config is None else Run(self.load_config, self.data)
         names = ("layout", "images_path", "masks_path", "classes_path", "ignore_ids")
-        parser = options_beside(self.load_config, self.data, **{name: getattr(self, name) for name in names})
-        report = check(parser, self.load_config)
+        parser = options_beside(run, self.data, **{name: getattr(self, name) for name in names})
+        report = check(parser, run)
         for line in report.lines():
             CONSOLE.print(line)
         for path in write_report(report, self.output or Path("outputs/masks_check") / report.data.name):
@@ -91,8 +93,9 @@ class Reproject:
                 reproject_run,
                 write_reprojection,
             )
-        options = ReprojectionOptions(self.masks_path, self.classes_path, run_size=self.run_size, data=self.data)
-        masks = reproject_run(self.load_config, options)
+            from beags_plugin.runs.run import Run
+        options = ReprojectionOptions(self.masks_path, self.classes_path, run_size=self.run_size)
+        masks = reproject_run(Run(self.load_config, self.data), options)
         output = self.output or self.load_config.parent / "reprojected"
         for line in write_reprojection(masks, output):
             CONSOLE.print(line)
@@ -127,8 +130,9 @@ class Agree:
         with starting(self):
             from beags_plugin.objects.agree_masks import agree_masks
             from beags_plugin.objects.reproject_masks import ReprojectionOptions
-        options = ReprojectionOptions(self.masks_path, self.classes_path, run_size=self.run_size, data=self.data)
-        for line in agree_masks(self.load_config, options, self.output, self.objects):
+            from beags_plugin.runs.run import Run
+        options = ReprojectionOptions(self.masks_path, self.classes_path, run_size=self.run_size)
+        for line in agree_masks(Run(self.load_config, self.data), options, self.output, self.objects):
             CONSOLE.print(line)
 
 
@@ -163,9 +167,11 @@ class Make:
         with starting(self):
             from beags_plugin.objects.check_masks import data_options
             from beags_plugin.objects.make_masks import configured_source, make_masks
+            from beags_plugin.runs.run import Run
         source = configured_source(self.source, self.options)
         data = data_options(self.data, self.layout, self.images_path)
-        for line in make_masks(data, source, self.load_config, self.output, self.overwrite, self.snap, self.upright):
+        run = None if self.load_config is None else Run(self.load_config, self.data)
+        for line in make_masks(data, source, run, self.output, self.overwrite, self.snap, self.upright):
             CONSOLE.print(line)
 
 

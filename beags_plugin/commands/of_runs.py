@@ -135,7 +135,7 @@ class Clean:
     """Replace a scene that was cleaned into the same folder before."""
 
     def run(self) -> None:
-        with starting(self):
+        with starting(self, nerfstudio=True):
             from beags_plugin.commands.clean import clean_scene
         clean_scene(self.scene, self.data, self.object, self.output, self.polish, self.steps, self.overwrite)
 

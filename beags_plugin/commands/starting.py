@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, get_args
 
@@ -23,16 +24,23 @@ from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.reading.text import reason
 from beags_plugin.system.shipped import shipped_names
 
+NERFSTUDIO_REPAIR = "pip install nerfstudio==1.1.5"
 LARGEST_CONFIG = 1 << 20  # Bytes; a run's config has some 20,000.
 
 
 @contextmanager
-def starting(command: Any) -> Iterator[None]:
+def starting(command: Any, nerfstudio: bool = False) -> Iterator[None]:
     """Check the arguments of a command; then show a spinner while the block imports what the command needs.
 
-    A run that is named by its folder becomes its config.yml. Raises ``UserError``.
+    A run that is named by its folder becomes its config.yml. nerfstudio: whether the command trains or opens the
+    viewer. Raises ``UserError``.
     """
     check_arguments(command)
+    if nerfstudio and find_spec("nerfstudio") is None:
+        raise UserError(
+            f"beags {type(command).__name__.lower()} needs nerfstudio, which is not installed here: "
+            f"{NERFSTUDIO_REPAIR}, or use the environment of make setup."
+        )
     with Console(stderr=True).status("starting"):
         yield
 

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 
+Depths = TypeVar("Depths", Tensor, np.ndarray)
 TAU = 0.02
 """Depths that differ by at most this share lie on one surface; a surface nearer by more hides it (method, E5)."""
+
+
+def hides(surface: Depths, depth: Depths) -> Depths:
+    """Return where a surface hides what lies at ``depth`` along the same ray: where it is nearer by more than ``TAU``.
+
+    surface: depths of any shape, 0 where there is none, which hides nothing. depth: the same shape, Tensor or array.
+    Returns booleans.
+    """
+    return (surface > 0) & (surface < (1.0 - TAU) * depth)  # type: ignore[return-value]  # numpy's operators
 
 
 def pixel_rays(camera: Camera, like: Tensor) -> Tensor:

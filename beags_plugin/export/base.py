@@ -35,6 +35,10 @@ class Exporter(ABC):
         """Return None if this exporter can run here, else one sentence: why not and what to install."""
         return None
 
+    def without_mesh(self) -> Exporter | None:
+        """Return an exporter of the same file without its mesh; None if nothing else is in it."""
+        return None if self.needs_photos else self
+
     def to_world(self, path: Path, origin: Tensor) -> bool:
         """Move a file that ``write`` made relative to ``origin`` [3] float64 to the world, in double precision.
 

@@ -53,12 +53,15 @@ class GltfBothExporter(TexturedExporter):
     suffix: ClassVar[str] = "both.glb"
     holds_gaussians: ClassVar[bool] = True
 
+    def without_mesh(self) -> Exporter:
+        return _WithoutMesh()
+
     def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
         own = without_invented(item)
         made = self.made(own)
         texture, facts = self.texture_of(made.mesh, own)
         document = Document()
-        children = [add_splats(document, part, f"{part.name} splats") for part in splat_parts(item)]
+        children = _splats(document, item)
         children.append(add_mesh(document, made.mesh, f"{item.name} mesh", texture, made.invented))
         document.roots.append(document.add("nodes", name=item.name, children=children))
         write_bytes(path, document.to_bytes())
@@ -66,6 +69,24 @@ class GltfBothExporter(TexturedExporter):
 
     def to_world(self, path: Path, origin: Tensor) -> bool:
         return glb_to_world(path, origin)
+
+
+@dataclass(frozen=True)
+class _WithoutMesh(GltfSplatsExporter):
+    """The file of ``GltfBothExporter`` with the splats alone, at the same places in the tree."""
+
+    suffix: ClassVar[str] = GltfBothExporter.suffix
+
+    def write(self, path: Path, item: ExportItem) -> dict[str, Any]:
+        document = Document()
+        document.roots.append(document.add("nodes", name=item.name, children=_splats(document, item)))
+        write_bytes(path, document.to_bytes())
+        return {}
+
+
+def _splats(document: Document, item: ExportItem) -> list[int]:
+    """Append a node for each part of an item; return their indices."""
+    return [add_splats(document, part, f"{part.name} splats") for part in splat_parts(item)]
 
 
 def add_splats(document: Document, part: SplatPart, name: str = "") -> int:

@@ -34,17 +34,16 @@ LEGEND = "black: in doubt, grey: changed"
 
 
 def agree_masks(
-    config_path: Path, options: ReprojectionOptions, output: Path | None = None, things: int = 1, enlarge: bool = False
+    run: Run, options: ReprojectionOptions, output: Path | None = None, things: int = 1, enlarge: bool = False
 ) -> list[str]:
     """Write masks of all training views that agree, classes.json, report.json and doubt.png; return lines for users.
 
-    config_path: config.yml of any run, trained with or without masks. options: of the data; those of reprojection are
+    run: any run, trained with or without masks. options: of the data; those of reprojection are
     not used. output: the folder; ``FOLDER`` beside config.yml if None. things: if above 1, the one object of the masks
     is split into at most so many separate things, which get its name and a number. enlarge: write masks made at the
     run's size at that of the photos, and name no next command. Raises ``UserError`` for a run or data that cannot be
     used, and if no mask of a training view names an object.
     """
-    run = Run(config_path, options.data)
     scene, manager = run.scene, data_to_reproject(run, options)
     views, files = manager.views("train"), manager.files["train"]
     with progress_bar("Reading masks", passing=True) as progress:
@@ -74,7 +73,7 @@ def agree_masks(
     if report.things is not None:
         name = next(name for class_id, name in classes.items() if class_id)
         classes = {0: classes[0], **{i: f"{name} {i}" for i in range(1, report.things.found + 1)}}
-    names, output = [view.name for view in views], output or config_path.parent / FOLDER
+    names, output = [view.name for view in views], output or run.folder / FOLDER
     with writing(output):
         for index, path in enumerate(mask_paths(manager.train_dataset.image_filenames)):
             (output / "masks" / path).parent.mkdir(parents=True, exist_ok=True)

@@ -29,7 +29,7 @@ from beags_plugin.masks.check.issues import LEVELS, Issue, ordered, percent
 from beags_plugin.objects.compare_views import agreements, pointed, points_in_space, tracks_of, turned
 from beags_plugin.objects.reproject_masks import ReprojectedRun, ReprojectionOptions, reproject_run
 from beags_plugin.pictures.masks import Changed, Pointed, contradicted_picture, coverage_picture
-from beags_plugin.runs.relocation import open_run
+from beags_plugin.runs.run import Run
 from beags_plugin.system.errors import writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.wording import amount
@@ -123,8 +123,8 @@ class Report:
         }
 
 
-def check(parser: DataOptions, run: Path | None = None) -> Report:
-    """Check the masks of a scene; if nothing stops training, also at the depths of a run (its config.yml)."""
+def check(parser: DataOptions, run: Run | None = None) -> Report:
+    """Check the masks of a scene; if nothing stops training, also at the depths of a run."""
     report = check_scene(parser)
     if run is not None and not report.stops:
         options = ReprojectionOptions(method="voxel", run_size=True, parser=parser)
@@ -251,15 +251,14 @@ def write_contradictions(report: Report, output: Path) -> list[Path]:
     return [picture]
 
 
-def options_beside(run: Path | None, data: Path | None, **given: Any) -> DataOptions:
+def options_beside(run: Run | None, data: Path | None, **given: Any) -> DataOptions:
     """Return the data options of a run, or the default ones without a run, with those ``given`` that are not None.
 
-    run: config.yml. data: folder of the scene; that of the run if None.
+    data: folder of the scene; that of the run if None.
     """
     config = DataOptions()
     if run is not None:
-        trained = open_run(run, data)
-        config = replace(trained.data_config.dataparser, data=trained.data_path)
+        config = replace(run.config.data_config.dataparser, data=run.config.data_path)
     if data is not None:
         config = replace(config, data=data)
     return replace(config, **{name: value for name, value in given.items() if value is not None})

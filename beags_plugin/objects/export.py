@@ -182,7 +182,7 @@ def _listed(manifest: Path) -> set[str]:
 
 
 def export_shown(
-    config_path: Path,
+    run: Run,
     surfels: Surfels,
     class_ids: Tensor,
     title: str,
@@ -193,16 +193,15 @@ def export_shown(
 ) -> Path:
     """Write the Gaussians that a viewer shows to a new file in ``exports/`` of the run; return its path.
 
-    config_path: config.yml of the run. surfels: M Gaussians in its frame. class_ids: [M] int32. title: file name before
-    the suffix. settings: depth range of the scene. progress: receives (done, total) rendered views of a mesh. scale_by:
-    see ``PoseOptions``. Raises ``UserError`` if nothing is shown, for an unknown format, for a format in millimetres if
-    the scene's size is unknown, and for a file that cannot be written.
+    surfels: M Gaussians in the run's frame. class_ids: [M] int32. title: file name before the suffix. settings: depth
+    range of the scene. progress: receives (done, total) rendered views of a mesh. scale_by: see ``PoseOptions``. Raises
+    ``UserError`` if nothing is shown, for an unknown format, for a format in millimetres if the scene's size is
+    unknown, and for a file that cannot be written.
     """
     exporter, pose = make_exporter(format_name), PoseOptions(scale_by=scale_by)
     _check_size(format_name, exporter, pose, "in the tab Size.")
     if len(surfels) == 0:
         raise UserError("nothing is shown, so there is nothing to export: show an object, or lower the least opacity.")
-    run = Run(config_path)
     frame, origin = run.frame, None if run.transform is None else local_origin(*run.transform)
     if origin is not None:
         frame = frame.centred(origin)
@@ -212,7 +211,7 @@ def export_shown(
     views = None
     if exporter.needs_views:
         views = frame.views(replace(run.viewpoints, settings=settings))
-    path = _free_path(config_path.parent / "exports", title, exporter.suffix)
+    path = _free_path(run.folder / "exports", title, exporter.suffix)
     total = 0 if views is None else len(views.cameras)
     item = ExportItem(
         title, frame.surfels(surfels), class_ids, views, on_render=lambda done: progress(done, total),

@@ -165,11 +165,15 @@ class ExportJob:
     def _write(
         self, label: str, exporter: Exporter, path: Path, item: ExportItem, class_id: int | None
     ) -> ExportedFile:
-        if self.tolerant and exporter.needs_photos and class_id == BACKGROUND:
-            reason = "a mesh of the background takes long: name it with --object if you want it"
-            return ExportedFile(label, None, {}, reason)
+        note = {}
+        if self.tolerant and class_id == BACKGROUND:
+            if (quick := exporter.without_mesh()) is None:
+                reason = "a mesh of the background takes long: name it with --object if you want it"
+                return ExportedFile(label, None, {}, reason)
+            note = {} if quick is exporter else {"mesh": "none, as one of the background takes long"}
+            exporter = quick
         try:
-            facts = exporter.write(path, item)
+            facts = {**exporter.write(path, item), **note}
             if self.shift is not None:
                 in_world = exporter.to_world(path, self.shift)
                 facts = {**facts, **({"coordinates": "world"} if in_world else {"origin": self.shift.tolist()})}

@@ -27,6 +27,8 @@ class ExportedFile:
         facts, parts = self.facts, []
         if "triangles" in facts:
             parts.append(f"{facts['triangles']:,} triangles")
+        if isinstance(mesh := facts.get("mesh"), str):
+            parts.append(f"no mesh{mesh.removeprefix('none')}")
         if isinstance(texture := facts.get("texture"), dict):
             size, share = texture["size"], texture["from_photos"]
             parts.append(f"a texture of {size} x {size}, {share:.0%} of it from photos")

@@ -26,7 +26,6 @@ from beags_plugin.objects.check_masks import check, options_beside, write_contra
 from beags_plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
 from beags_plugin.pictures.cells import below, wrapped, write_picture
 from beags_plugin.pictures.masks import tinted_cell
-from beags_plugin.runs.relocation import open_run
 from beags_plugin.runs.run import Run
 from beags_plugin.system.errors import UserError, check_choice, writing
 from beags_plugin.system.progress import progress_bar
@@ -39,9 +38,9 @@ from beags_plugin.views.scene_data import SceneData
 class RunGeometry:
     """The surfaces of a trained run at the size of the photos, for its training views, then for the others."""
 
-    def __init__(self, config_path: Path, data: Path | None = None) -> None:
-        self.folder = config_path.parent
-        self.run = Run(config_path, None if open_run(config_path).data_path.exists() else data)
+    def __init__(self, run: Run) -> None:
+        self.folder = run.folder
+        self.run = run
         self.manager = data_to_reproject(self.run, ReprojectionOptions())
         self.images = list(self.manager.train_dataset.image_filenames)
         self.cameras = [view.camera for view in self.manager.views("train")]
@@ -106,7 +105,7 @@ def configured_source(name: str, options: Sequence[str]) -> MaskSource:
 def make_masks(
     data: DataOptions,
     source: MaskSource,
-    run: Path | None = None,
+    run: Run | None = None,
     output: Path | None = None,
     overwrite: bool = False,
     snap: int = 0,
@@ -114,7 +113,7 @@ def make_masks(
 ) -> list[str]:
     """Write the masks of a scene: <output>/masks/<stem>.png, classes.json and made.png, a picture of them.
 
-    The files replace the old masks of all views once all are made. data: names the scene. run: config.yml of a run
+    The files replace the old masks of all views once all are made. data: names the scene. run: a run
     trained on it, for sources that need one. output: if None the scene's own folder, where ``beags-data`` looks for
     masks. overwrite: replace existing masks. snap: radius in pixels of ``masks.snapping.snap_to_edges``; 0 leaves
     outlines unchanged. upright: the source makes masks of the upright photos; they are turned to the photos as stored.
@@ -143,7 +142,7 @@ def make_masks(
         if source.needs_run:
             raise UserError("this mask source uses the photos as they are stored: leave --upright out.")
         photos = [photo.upright() for photo in photos]
-    geometry = RunGeometry(run, data.data) if run is not None and source.needs_run else None
+    geometry = RunGeometry(run) if run is not None and source.needs_run else None
     shares: list[float] = []
     pictured: list[tuple[Photo, Path]] = []
     with writing(folder):

@@ -13,7 +13,7 @@ from beags_plugin.masks.sources.cut import DrawnSource
 from beags_plugin.objects.check_masks import options_beside
 from beags_plugin.objects.make_masks import make_masks
 from beags_plugin.runs.layout import refinable
-from beags_plugin.runs.relocation import open_run
+from beags_plugin.runs.run import Run
 from beags_plugin.runs.run_config import RunConfig
 from beags_plugin.system.digests import content_digest
 from beags_plugin.system.errors import UserError
@@ -39,35 +39,28 @@ def masks_folder(run: Path) -> Path:
     return next((run / name for name in names if not masks_changed(run / name)), run)
 
 
-def save_masks(
-    config_path: Path,
-    members: Membership,
-    names: Mapping[int, str],
-    folder: Path | None = None,
-    photos: Path | None = None,
-) -> SavedMasks:
+def save_masks(run: Run, members: Membership, names: Mapping[int, str], folder: Path | None = None) -> SavedMasks:
     """Write masks of all training views, classes.json and made.png.
 
-    config_path: of the run. members: of its Gaussians. folder: for the masks; ``masks_folder`` if None. photos: folder
-    of the scene if it has moved. Raises ``UserError`` if there is no object, if files cannot be written, and for a
-    folder with ``masks_changed``.
+    members: of the run's Gaussians. folder: for the masks; ``masks_folder`` if None. Raises ``UserError`` if there is
+    no object, if files cannot be written, and for a folder with ``masks_changed``.
     """
     if not any(class_id != BACKGROUND for class_id in members.present()):
         raise UserError("nothing has been picked yet: click on an object first.")
-    run, data = config_path.parent, options_beside(config_path, photos)
+    data = options_beside(run, None)
     scene = Path(data.data).absolute()
     scene = scene if scene.is_dir() else scene.parent
-    folder = masks_folder(run) if folder is None else folder.absolute()
-    if folder == run or masks_changed(folder):
+    folder = masks_folder(run.folder) if folder is None else folder.absolute()
+    if folder == run.folder or masks_changed(folder):
         raise UserError(f"{folder} holds masks that were not written here, or have been changed: name another folder.")
     again = _holds_masks(folder)
-    make_masks(data, DrawnSource(members, names), config_path, folder, overwrite=again)
+    make_masks(data, DrawnSource(members, names), run, folder, overwrite=again)
     write_text_atomically(_digest(folder), folder / STAMP)
     sentence = f"{'Replaced' if again else 'Saved'} {folder / 'masks'} and classes.json; look at {folder / 'made.png'}."
     own: dict[str, Any] = {"masks_path": None, "classes_path": Path("classes.json"), "ignore_ids": ()}
     if folder != scene:
         own |= {"masks_path": folder / "masks", "classes_path": folder / "classes.json"}
-    return SavedMasks(sentence, refinement_command(open_run(config_path, photos), replace(data, **own)))
+    return SavedMasks(sentence, refinement_command(run.config, replace(data, **own)))
 
 
 def refinement_command(config: RunConfig, parser: DataOptions) -> str:

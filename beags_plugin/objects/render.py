@@ -51,20 +51,19 @@ def render_run(
     total) pictures. data: folder of the scene if it has moved. Raises ``UserError`` for a mistake, before anything is
     rendered.
     """
-    options = options or RenderOptions()
+    run, options = Run(config_path, data), options or RenderOptions()
     options.check()
     check_choice(form, get_args(PictureFormat), "format")
     if options.camera_path is not None:
-        return _along(options.camera_path, config_path, objects, form, output, options, progress)
-    run = Run(config_path, data)
+        return _along(options.camera_path, run, objects, form, output, options, progress)
     scene = run.assigned
-    chosen = chosen_objects(scene, objects, config_path.parent)
+    chosen = chosen_objects(scene, objects, run.folder)
     if output is None:
         title = folder_names(scene.classes)[next(iter(chosen.values()))] if len(chosen) == 1 else "objects"
         suffix = ".png" if form != "video" else _film_suffix()
-        output = config_path.parent / "renders" / f"{title}_{form}{suffix}"
+        output = run.folder / "renders" / f"{title}_{form}{suffix}"
     moving = _check_output(output, form)
-    stages = {"": scene} if form != "before-after" else {"before": _base_of(config_path), "after": scene}
+    stages = {"": scene} if form != "before-after" else {"before": _base_of(run), "after": scene}
     subjects = _subjects(run, stages, chosen, form, moving, options)
     if moving:
         write_film(output, film(subjects, run.rasterizer, options.background, progress), options.fps)
@@ -80,26 +79,25 @@ def _film_suffix() -> str:
 
 def _along(
     path: Path,
-    config_path: Path,
+    run: Run,
     objects: Sequence[str],
     form: str,
     output: Path | None,
     options: RenderOptions,
     progress: Progress | None,
 ) -> Path:
-    """Film the objects together, or the whole scene, along a camera path; arguments as of ``render_run``."""
+    """Film the objects of a run together, or the whole scene, along a camera path; arguments as of ``render_run``."""
     if form == "sheet":
         raise UserError("a camera path gives a video: leave --format sheet or --camera-path out.")
     changed = {each.name for each in fields(options) if getattr(options, each.name) != each.default}
     if ignored := sorted(changed - {"background", "camera_path"}):
         raise UserError(f"a camera path has a size, cameras and speed of its own: leave --{ignored[0]} out.")
     cameras, fps = read_camera_path(path)
-    output = output or config_path.parent / "renders" / f"{path.stem}_{form}{_film_suffix()}"
+    output = output or run.folder / "renders" / f"{path.stem}_{form}{_film_suffix()}"
     check_film(output)
-    run = Run(config_path)
     scene = run.assigned if objects or form != "video" else run.scene
-    stages = {"": scene} if form == "video" else {"before": _base_of(config_path), "after": scene}
-    present = objects_with_gaussians(scene, objects, config_path.parent) if objects else {}
+    stages = {"": scene} if form == "video" else {"before": _base_of(run), "after": scene}
+    present = objects_with_gaussians(scene, objects, run.folder) if objects else {}
     parts, cleaner = {}, cleaner_of(Shown(run))
     for caption, each in stages.items():
         rows = [_part(run, each, present[name], cleaner)[1] for name in objects]
@@ -121,12 +119,12 @@ def _check_output(path: Path, form: str) -> bool:
     return False
 
 
-def _base_of(config_path: Path) -> SavedScene:
+def _base_of(run: Run) -> SavedScene:
     """Return the state before refinement, which a refined run has saved."""
-    snapshot = config_path.parent / BASE_SNAPSHOT / "config.yml"
+    snapshot = run.folder / BASE_SNAPSHOT / "config.yml"
     if not snapshot.exists():
         raise UserError(
-            f"{config_path.parent} has no saved state from before refinement ({BASE_SNAPSHOT}/): name the run that was "
+            f"{run.folder} has no saved state from before refinement ({BASE_SNAPSHOT}/): name the run that was "
             "refined, or another --format."
         )
     return Run(snapshot).assigned

@@ -39,7 +39,6 @@ class ReprojectionOptions:
 
     masks: folder of other id images. classes: their classes.json. method: name of a reprojection. run_size: reproject
     at the size of the training instead of the photos'. parser: options of ``beags-data`` instead of the run's own.
-    data: folder of the scene if it has moved.
     """
 
     masks: Path | None = None
@@ -47,7 +46,6 @@ class ReprojectionOptions:
     method: str | None = None
     run_size: bool = False
     parser: DataOptions | None = None
-    data: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -82,13 +80,11 @@ class ReprojectedRun:
         )
 
 
-def reproject_run(config_path: Path, options: ReprojectionOptions) -> ReprojectedRun:
+def reproject_run(run: Run, options: ReprojectionOptions) -> ReprojectedRun:
     """Reproject masks with the depth of a run, trained with or without masks.
 
-    config_path: config.yml of any run. Raises ``UserError`` for a run, data or an option that cannot be used, and if no
-    view has a mask.
+    Raises ``UserError`` for a run, data or an option that cannot be used, and if no view has a mask.
     """
-    run = Run(config_path, options.data)
     scene, manager = run.scene, data_to_reproject(run, options)
     config = scene.config.model_config.prepare
     config = replace(config, reprojection=options.method or config.reprojection)

@@ -20,7 +20,6 @@ from beags_plugin.objects.export import Progress
 from beags_plugin.objects.extract import chosen_objects, file_name
 from beags_plugin.objects.reproject_masks import ReprojectionOptions, data_to_reproject, mask_paths
 from beags_plugin.rasterizers.rendering import surfel_inputs
-from beags_plugin.runs.relocation import open_run
 from beags_plugin.runs.run import Run
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.whole_files import write_whole
@@ -50,11 +49,11 @@ def write_underlays(
     the folder; ``renders/underlay`` of the run if None. progress: receives (done, total) pictures. data: folder of the
     scene if it has moved. Raises ``UserError`` for a mistake, before anything is written.
     """
-    run = Run(config_path, None if open_run(config_path).data_path.exists() else data)
+    run = Run(config_path, data)
     scene = run.assigned
-    chosen = chosen_objects(scene, objects, config_path.parent)
+    chosen = chosen_objects(scene, objects, run.folder)
     manager = data_to_reproject(run, ReprojectionOptions())
-    folder = output or config_path.parent / "renders" / "underlay"
+    folder = output or run.folder / "renders" / "underlay"
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder} is a file: name a folder with --output.")
     rasterizer, settings = run.rasterizer, run.settings

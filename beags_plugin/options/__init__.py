@@ -1,1 +1,1 @@
-"""Options of the scene and of its training: data, without behaviour."""
+"""Options of the scene and of its training, and their checks, without nerfstudio."""

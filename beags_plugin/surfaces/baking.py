@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.exposure import BRIGHT, DARK, even_exposures
-from beags_plugin.core.lifting import TAU, project
+from beags_plugin.core.lifting import hides, project
 from beags_plugin.surfaces.color import linear_from_srgb, srgb_from_linear
 from beags_plugin.surfaces.fusion import Mesh
 from beags_plugin.surfaces.item import Photo
@@ -92,7 +92,7 @@ def places_seen(places: Places, mesh: Mesh, caster: Any, photo: Photo) -> Observ
     column, row = np.floor(xy[index]).astype(np.int64).T
     column, row = np.minimum(column, camera.width - 1), np.minimum(row, camera.height - 1)
     depth = photo.depth().numpy()[row, column]
-    index = index[well_inside(photo)[row, column] & ~((depth > 0) & (depth < (1.0 - TAU) * z[index]))]
+    index = index[well_inside(photo)[row, column] & ~hides(depth, z[index])]
     index = index[~_hidden(caster, mesh, places[index], camera.center.double().numpy())]
     light = linear_from_srgb(interpolated(photo.image(), xy[index]))
     pixels = cosine[index] * (camera.focal * places.spacing / z[index]) ** 2  # pixels per place

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.lifting import TAU, pixels_of
+from beags_plugin.core.lifting import TAU, hides, pixels_of
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.select import select_class
@@ -59,7 +59,7 @@ class Witnesses:
         other = (label != self._class_ids) & (label != IGNORE)
         is_object = other & (label != BACKGROUND)
         self.hidden += faces & is_object & (surface < z)
-        self.open += faces & other & ((surface >= (1.0 + TAU) * z) | (~is_object & (surface < (1.0 - TAU) * z)))
+        self.open += faces & other & ((surface >= (1.0 + TAU) * z) | (~is_object & hides(surface, z)))
 
     def in_contact(self) -> Tensor:
         """Return [M] bool, which places are hidden by another object in more views than show them open."""

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from beags_plugin.core.lifting import TAU
+from beags_plugin.core.lifting import hides
 from beags_plugin.surfaces.atlas import Atlas
 from beags_plugin.surfaces.baking import FLATTEST, well_inside
 from beags_plugin.surfaces.color import linear_from_srgb, srgb_from_linear
@@ -94,7 +94,7 @@ def _pixels(photo: Photo, atlas: Atlas, mesh: Mesh, caster: Any) -> tuple[np.nda
     depth, normals = hit["t_hit"].numpy(), hit["primitive_normals"].numpy()
     cosine = -np.einsum("pd,pd->p", normals, directions) / np.linalg.norm(directions, axis=1)
     scene = np.repeat(photo.depth().numpy()[rows, cols], len(_RAYS))
-    good = np.isfinite(depth) & (cosine > FLATTEST) & ~((scene > 0) & (scene < (1.0 - TAU) * depth))
+    good = np.isfinite(depth) & (cosine > FLATTEST) & ~hides(scene, depth)
     whole = good.reshape(-1, len(_RAYS)).all(axis=1)
     rays_of = np.repeat(whole, len(_RAYS))
     face = hit["primitive_ids"].numpy()[rays_of].astype(np.int64)

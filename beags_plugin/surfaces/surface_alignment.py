@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from beags_plugin.core.lifting import TAU, project
+from beags_plugin.core.lifting import hides, project
 from beags_plugin.surfaces.baking import Observations, Places, exposures_of, interpolated, places_seen
 from beags_plugin.surfaces.color import linear_from_srgb
 from beags_plugin.surfaces.fusion import Mesh
@@ -75,7 +75,7 @@ def outline_iou(mesh: Mesh, photos: Sequence[Photo], progress: Callable[[int], N
         rays, _ = rays_through(mesh, camera, np.stack([columns, rows], axis=1) + 0.5)
         hit = caster.cast_rays(rays)["t_hit"].numpy()
         mask, scene = own[rows, columns], depth[rows, columns]
-        hidden = ~mask & (scene > 0) & (scene < (1.0 - TAU) * hit)
+        hidden = ~mask & hides(scene, hit)
         outline = np.isfinite(hit) & ~hidden
         both, either = both + int((outline & mask).sum()), either + int((outline | mask).sum())
         progress(done)

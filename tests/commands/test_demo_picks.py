@@ -62,9 +62,9 @@ class Stand:
             (folder / picked_masks.STAMP).write_text(picked_masks._digest(folder))
         return SimpleNamespace(returncode=self.code)
 
-    def apart(self, config, options, output, things, enlarge) -> list[str]:
+    def apart(self, run, options, output, things, enlarge) -> list[str]:
         """Stand in for the separation of things."""
-        self.said.append(["apart", str(config), str(options.masks), str(things), str(enlarge)])
+        self.said.append(["apart", str(run.config_path), str(options.masks), str(things), str(enlarge)])
         mask = np.full(SIZE, len(self.said) % 2, np.uint8) if self.mask is None else self.mask
         write_image(output / "masks/v01.png", mask)
         (output / "classes.json").write_text('{"1": "bear 1", "7": "bear 7", "8": "bear 8"}')

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from data_folders import HEIGHT, WIDTH, write_colmap, write_image, write_transforms
-from run_folders import discs, write_drawn_scene, write_scene, write_trained
+from run_folders import discs, drawn_labels, ring_cameras, write_drawn_scene, write_scene, write_trained
 from source_scenes import truth
 
 from beags_plugin.commands.cli import main
@@ -171,12 +171,13 @@ def test_the_check_of_a_run_takes_its_options_and_what_replaces_them(tmp_path):
 
     data = write_scene(tmp_path / "scene")
     config = write_trained(tmp_path / "run", data)
-    own = options_beside(config, None)
+    run = Run(config)
+    own = options_beside(run, None)
     assert own.data == data and own.orientation_method == "none"  # The run was trained with these.
     (data / "masks").rename(data / "others")
-    parser = options_beside(config, None, masks_path=Path("others"), ignore_ids=(2,), layout=None)
+    parser = options_beside(run, None, masks_path=Path("others"), ignore_ids=(2,), layout=None)
     assert (parser.layout, parser.orientation_method) == (own.layout, "none")
-    manager = data_to_reproject(Run(config), ReprojectionOptions(run_size=True, parser=parser))
+    manager = data_to_reproject(run, ReprojectionOptions(run_size=True, parser=parser))
     labels = manager.views("train")[0].labels
     assert labels is not None and set(labels.unique().tolist()) == {0, 1, IGNORE}
     main(["masks", "check", "--load-config", str(config), "--masks-path", "others", "--output", str(tmp_path / "out")])
@@ -185,14 +186,30 @@ def test_the_check_of_a_run_takes_its_options_and_what_replaces_them(tmp_path):
 
 def test_the_geometry_of_a_run_has_its_held_out_views_too(tmp_path):
     from beags_plugin.objects.make_masks import RunGeometry
+    from beags_plugin.runs.run import Run
 
     data = write_scene(tmp_path / "scene")
-    geometry = RunGeometry(write_trained(tmp_path / "run", data))
+    geometry = RunGeometry(Run(write_trained(tmp_path / "run", data)))
     assert [path.stem for path in geometry.images] == [f"v{index:02d}" for index in (*range(1, 8), 0, 8)]
     ids = truth(0)
     for view in (0, 7, 8):
         straight = geometry.to_straight(ids.astype(np.uint16), view)
         np.testing.assert_array_equal(geometry.to_photo(straight, view), ids)  # this scene has no lens distortion
+
+
+def test_masks_are_made_in_a_copy_of_the_scene_that_the_run_was_trained_on(tmp_path):
+    """The recorded folder still exists: the named one counts all the same."""
+    from shutil import copytree
+
+    data = write_scene(tmp_path / "scene", masks=False)
+    config = write_trained(tmp_path / "run", data)
+    copytree(data, tmp_path / "copy")
+    row, column = (drawn_labels(ring_cameras(9, 1)[1]) == 1).nonzero()[0].tolist()
+    cup = {"name": "cup", "prompts": [{"view": "v01", "points": [[column, row]]}]}
+    (tmp_path / "prompts.json").write_text(json.dumps({"objects": [cup]}))
+    main(["masks", "make", "--data", str(tmp_path / "copy"), "--source", "cut", "--load-config", str(config),
+          "--overwrite", "--options", f"prompts={tmp_path / 'prompts.json'}"])  # fmt: skip
+    assert len(list((tmp_path / "copy/masks").glob("*.png"))) > 0 and not (data / "masks").exists()
 
 
 def test_agreement_overrules_the_mask_that_contradicts_the_others(tmp_path, capsys):

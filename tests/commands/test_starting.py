@@ -11,6 +11,7 @@ import sys
 import pytest
 from run_folders import write_scene, write_trained
 
+from beags_plugin.commands.cli import main
 from beags_plugin.commands.starting import check_arguments, run_config
 from beags_plugin.system.errors import UserError, check_choice
 
@@ -60,6 +61,18 @@ def test_mistakes_are_refused_before_anything_heavy_is_imported(folder):
     for (row, sentence), (said, heavy) in zip(AT_ONCE.items(), json.loads(done.stdout), strict=True):
         assert said.replace(str(folder), "{tmp}").startswith(f"beags: {sentence}"), f"{row}: {said}"
         assert not heavy, f"{row} imported {heavy} first"
+
+
+@pytest.mark.parametrize("words", ["demo", "resume {tmp}/run", "view {tmp}/run", "clean a.ply --data {tmp}/lab"])
+def test_commands_that_need_nerfstudio_say_so_where_it_is_not_installed(folder, words, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "nerfstudio", None)
+    with pytest.raises(SystemExit) as ended:
+        main(words.replace("{tmp}", str(folder)).split())
+    said = " ".join(capsys.readouterr().out.split())
+    assert ended.value.code == 2 and said == (
+        f"beags: beags {words.split()[0]} needs nerfstudio, which is not installed here: pip install "
+        "nerfstudio==1.1.5, or use the environment of make setup."
+    )
 
 
 def test_a_terminal_shows_that_the_command_has_begun(folder):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.lifting import lift, pixel_rays, project
+from beags_plugin.core.lifting import TAU, hides, lift, pixel_rays, project
 
 
 def _camera(skew: float = 0.0) -> Camera:
@@ -29,6 +29,21 @@ def test_lift_solves_the_camera_equation_of_every_pixel(skew):
         for i in range(7):
             homogeneous = K @ (W @ points[j, i] + t)
             assert np.allclose(homogeneous, depth[j, i].item() * np.array([i + 0.5, j + 0.5, 1.0]), atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_surface_hides_what_lies_behind_it_by_more_than_a_fiftieth(dtype):
+    """The same bits for tensors and arrays, at the threshold too; no surface and no hit hide nothing."""
+    depth = np.linspace(0.1, 100.0, 999, dtype=dtype)
+    limit = ((1.0 - TAU) * depth).astype(dtype)
+    for surface, hidden in (
+        (limit, False), (np.nextafter(limit, dtype(0)), True), (0 * depth, False), (1.01 * depth, False),
+        (depth, False), (np.full_like(depth, np.inf), False), (np.full_like(depth, np.nan), False),
+    ):  # fmt: skip
+        found = hides(surface, depth)
+        assert found.dtype == bool and (found == hidden).all()
+        assert np.array_equal(hides(torch.from_numpy(surface), torch.from_numpy(depth)).numpy(), found)
+    assert hides(depth, np.full_like(depth, np.inf)).all()  # rays that miss a mesh
 
 
 def test_project_undoes_lift():

@@ -7,7 +7,15 @@ import shutil
 
 import pytest
 import torch
-from run_folders import discs, drawn_labels, ring_cameras, state_of, write_drawn_scene, write_trained
+from run_folders import (
+    discs,
+    drawn_labels,
+    ring_cameras,
+    state_of,
+    write_camera_path,
+    write_drawn_scene,
+    write_trained,
+)
 
 pytest.importorskip("nerfstudio")
 
@@ -16,7 +24,9 @@ from written_splats import read_ply
 from beags_plugin.commands.cli import main
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.classes import write_mask
+from beags_plugin.runs.belonging import Belonging
 from beags_plugin.runs.relocation import open_run
+from beags_plugin.runs.run import Run
 from beags_plugin.runs.write import write_run
 
 CHIP = 3  # discs
@@ -77,6 +87,16 @@ def test_export_leaves_out_the_same(trained, tmp_path, capsys):
     assert counts == {"background": None, "cup": 3, "box": 0}
     main([*arguments, str(tmp_path / "all"), "--keep-all"])
     assert len(read_ply(tmp_path / "all/cup.ply")[0]) == 25 + CHIP
+
+
+def test_a_film_along_a_camera_path_leaves_out_the_same_also_with_moved_photos(trained, tmp_path):
+    (tmp_path / "lab").rename(tmp_path / "moved")
+    path = write_camera_path(tmp_path / "flight.json")
+    main(["render", "--load-config", str(trained), "--camera-path", str(path), "--object", "cup",
+          "--data", str(tmp_path / "moved"), "--output", str(tmp_path / "flight.gif")])  # fmt: skip
+    assert (tmp_path / "flight.gif").exists()
+    dropped, _ = Belonging(Run(trained).scene, trained.parent).known(1)
+    assert dropped.tolist() == [75, 76, 77]
 
 
 def test_without_masks_or_data_nothing_is_left_out_and_the_line_says_so(trained, tmp_path, capsys):

@@ -24,6 +24,7 @@ from beags_plugin.core.select import select_class
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.export import EXPORTERS
 from beags_plugin.export.base import Exporter, make_exporter
+from beags_plugin.importers.base import read_scene
 from beags_plugin.objects import export
 from beags_plugin.objects.export import export_run
 from beags_plugin.objects.exported import ExportedFile
@@ -278,6 +279,19 @@ def test_the_progress_of_meshes_counts_their_views(trained, tmp_path):
     )  # fmt: skip
     assert {total for _, total in steps} == {2 * (1 + 8 + 8)}
     assert [done for done, _ in steps] == [0, *range(1, 10), 17, 18, *range(19, 27), 34]
+
+
+def test_the_background_keeps_its_splats_in_a_format_of_both(trained, tmp_path, capsys):
+    pytest.importorskip("open3d")
+    main(["export", "--load-config", str(trained), "--all", "--format", "gltf-both", "glb", "--resolution", "8",
+          "--output", str(tmp_path)])  # fmt: skip
+    said = " ".join(capsys.readouterr().out.split())
+    assert "background.both.glb (no mesh, as one of the background takes long)" in said
+    assert "no glb: a mesh of the background takes long" in said and not (tmp_path / "background.glb").exists()
+    assert len(read_scene(tmp_path / "background.both.glb").gaussians) == 25
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    (background,) = (each for each in manifest["objects"] if each["name"] == "background")
+    assert [each.get("mesh", "")[:4] for each in background["files"]] == ["none"]
 
 
 def test_meshes_need_the_data(tmp_path, capsys):

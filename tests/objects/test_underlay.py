@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -133,6 +135,18 @@ def test_the_command_says_where_drawings_go(run, tmp_path, capsys):
     text = " ".join(capsys.readouterr().out.split())
     assert f"underlay: 2 pictures in {tmp_path}/out" in text
     assert f"{run.parent.parent}/data/ground_truth/silhouettes/<object>/<photo>.png; beags eval reads it." in text
+
+
+def test_the_photos_are_those_of_the_named_folder(run, tmp_path):
+    """The recorded folder still exists: the named one counts all the same."""
+    data = run.parent.parent / "data"
+    shutil.copytree(data, tmp_path / "other")
+    white = np.full((FACTOR * HEIGHT, FACTOR * WIDTH, 3), 255, np.uint8)
+    write_image(tmp_path / "other/images/v00.png", white)
+    made = write_underlays(run, ["cup"], tmp_path / "out", data=tmp_path / "other")
+    assert made.silhouettes == tmp_path / "other/ground_truth/silhouettes"
+    underlay = read(made.folder / "cup/v00.png")
+    assert not drawn_over(underlay, white)[0].any() and drawn_over(underlay, read(data / "images/v00.png"))[0].any()
 
 
 def test_a_base_without_classes_has_no_underlay(tmp_path):

@@ -21,6 +21,7 @@ from run_folders import write_prepared, write_scene, write_trained
 from viser import _gui_api, _gui_handles, _icons
 
 from beags_plugin.core.cameras import Camera, viewmat_from_opengl
+from beags_plugin.plugin.viewer.serve import viewed_pipeline
 
 _gui_api.svg_from_icon = _gui_handles.svg_from_icon = cache(_icons.svg_from_icon)
 """Viser lists an archive of thousands of icons for each one that it shows."""
@@ -92,10 +93,14 @@ class Window:
 
 
 class Stand:
-    """The same without server and pictures: what the panel is told of a viewer, quick to make."""
+    """The same without server and pictures: what the panel is told of a viewer, quick to make.
 
-    def __init__(self, config_path, trainer=None, change=lambda model: None) -> None:
-        _, pipeline, _, _ = eval_setup(config_path, test_mode="test")
+    data: as of ``beags view --data``.
+    """
+
+    def __init__(self, config_path, trainer=None, change=lambda model: None, data: Path | None = None) -> None:
+        opened = eval_setup(config_path, test_mode="test") if data is None else viewed_pipeline(config_path, data)
+        pipeline = opened[1]
         self.model, self.panel = pipeline.model, pipeline.model.viewer_panel
         change(self.model)
         self.panel._follow = lambda: None

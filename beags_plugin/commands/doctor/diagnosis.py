@@ -10,11 +10,12 @@ from pathlib import Path
 
 from beags_plugin.commands.doctor.backends import first_contact_check, rasterizers
 from beags_plugin.commands.doctor.check import Check, first_line
+from beags_plugin.commands.starting import NERFSTUDIO_REPAIR
 
 _OPENCV = "pip install --force-reinstall --no-deps opencv-contrib-python-headless==4.10.0.84"
 _REPAIRS = {  # Repair for a check that raises, by its name.
     "torch": "pip install torch",
-    "nerfstudio": "pip install nerfstudio==1.1.5",
+    "nerfstudio": NERFSTUDIO_REPAIR,
     "opencv": _OPENCV,
     "presets": "pip install -c constraints.txt -e .",
 }

@@ -1,1 +1,1 @@
-"""Options of ``ns-train beags``: fields and checks, no behaviour."""
+"""The config of ``ns-train beags``: its fields and checks, how it is saved and loaded, and the lock of its run."""

@@ -65,10 +65,9 @@ class ShownFiles:
         if viewing.run is None:
             raise UserError("no viewer shows this scene: use beags export.")
         scene = self._part()
-        config_path = viewing.run.folder / "config.yml"
         with torch.no_grad():
             return export_shown(
-                config_path, scene.surfels, scene.class_ids, self._title(), self._format_name(),
+                viewing.run.opened(), scene.surfels, scene.class_ids, self._title(), self._format_name(),
                 viewing.model.settings(), self.report_views, scale_by,
             )  # fmt: skip
 

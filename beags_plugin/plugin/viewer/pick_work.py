@@ -25,6 +25,7 @@ from beags_plugin.plugin.viewer.legend import capitalised
 from beags_plugin.plugin.viewer.other_sides import sides_picture
 from beags_plugin.plugin.viewer.viewing import Paint, Viewing
 from beags_plugin.runs.picked import with_picked, write_picked
+from beags_plugin.runs.run import Run
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
 
@@ -133,7 +134,7 @@ class PickWork:
             self._report("Rendering masks of all training views ...")
             if errand is not None:  # Classes of masks that the scene may have are left out.
                 names = {each: name for each, name in names.items() if each in (BACKGROUND, *members.present())}
-            saved = save_masks(self._run() / "config.yml", members, names, folder, self._photos())
+            saved = save_masks(self._opened(), members, names, folder)
             if ended is not None:
                 say(saved.said)
                 self._report(f"{saved.said} The viewer closes now; the program that opened it goes on.")
@@ -151,7 +152,7 @@ class PickWork:
         def do() -> str:
             viewing, model = self._viewing, self._viewing.model
             members, names = self.picks.applied(model.members(), model.classes)
-            path = write_picked(self._run(), model.means, members, names)
+            path = write_picked(self._opened().folder, model.means, members, names)
             with viewing.lock:
                 model.take_members(members)
                 model.classes = names
@@ -180,15 +181,9 @@ class PickWork:
         index = members.nonzero()[:, 0].to(surfels.means.device)
         return Visible(surfels[index], torch.ones(len(index), dtype=torch.int32, device=index.device), index)
 
-    def _run(self) -> Path:
+    def _opened(self) -> Run:
         assert self._viewing.run is not None
-        return self._viewing.run.folder
-
-    def _photos(self) -> Path | None:
-        """Return the folder of the photos, which may have been given when the viewer was opened."""
-        assert self._viewing.run is not None
-        data = self._viewing.run.datamanager.config.data
-        return None if data is None else Path(data).absolute()
+        return self._viewing.run.opened()
 
     def _summary(self, former: Tensor | None = None, seconds: float | None = None) -> str:
         one = self.picks.chosen

@@ -69,7 +69,7 @@ class SizeTab:
 
     def _run(self) -> Run:
         assert self.viewing.run is not None
-        return Run(self.viewing.run.folder / "config.yml")
+        return self.viewing.run.opened()
 
     # -- what the tab shows ------------------------------------------------------------------------------------------
 
@@ -108,10 +108,10 @@ class SizeTab:
         if not self.measure.places and not self.measure.length.strip():
             return escaped(_HELP)
         try:
-            text = self.scale_by()
+            run = self._run()
+            text = self.measure.scale_by(run.frame)
             length = PoseOptions(scale_by=text).length()
             assert length is not None
-            run = self._run()
             metres = metres_per_unit(length, run, run.frame)
         except UserError as error:
             return escaped(capitalised(error))

@@ -17,6 +17,7 @@ from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.runs.layout import EXTRACTION_FILE, PREPARED, digest_of_prepared, files_digest, preparing_run
 from beags_plugin.runs.prepared import grid_state, read_grid
+from beags_plugin.runs.run import Run
 from beags_plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.views.views import unique_names
 
@@ -47,6 +48,11 @@ class ViewedRun:
         self._after = lru_cache(_KEPT_MASKS)(_read_mask)
         self._kept = digest_of_prepared(folder) if (folder / EXTRACTION_FILE).exists() else None
         self._digest = lru_cache(1)(lambda folder, _changed: files_digest(folder))
+
+    def opened(self) -> Run:
+        """Open the run as it is on disk now (training and picking change it), with the photos that the viewer shows."""
+        data = self.datamanager.config.data
+        return Run(self.folder / "config.yml", None if data is None else Path(data).absolute())
 
     @property
     def prepared(self) -> Path | None:

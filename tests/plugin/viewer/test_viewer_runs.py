@@ -18,6 +18,7 @@ from viewer_windows import ALWAYS, Stand, write_finished
 
 from beags_plugin.labels.classes import write_mask
 from beags_plugin.objects.extract import extract_objects
+from beags_plugin.plugin.viewer.export import ShownFiles
 from beags_plugin.plugin.viewer.viewing import CHANNELS
 from beags_plugin.system.errors import UserError
 
@@ -36,6 +37,17 @@ def test_a_run_in_training_lists_what_will_come(finished):
     window.model.assigned.fill_(True)
     window.panel.follow()
     assert window.look("class_map")["class_map"].sum() > 0.0 and window.panel.object.options[1] == "cup"
+
+
+@pytest.mark.parametrize("name", ["html", "glb"])
+def test_a_viewer_of_moved_photos_exports_what_needs_their_cameras(tmp_path, name):
+    if name == "glb":
+        pytest.importorskip("open3d")
+    config = write_trained(tmp_path / "run", write_scene(tmp_path / "lab"))
+    (tmp_path / "lab").rename(tmp_path / "moved")
+    window = Stand(config, data=tmp_path / "moved")
+    files = ShownFiles(window.model.viewing, lambda: "all", lambda: name, lambda text: None)
+    assert files.write() == tmp_path / f"run/exports/all.{name}" and files.write().stat().st_size > 1000
 
 
 def test_masks_of_a_former_run_in_the_folder_are_not_shown_while_a_base_is_trained(tmp_path):

@@ -93,6 +93,7 @@ def make_masks_once(found: FoundCapture, kind: str, folder: Path, run: Path | No
     from beags_plugin.masks.sources.cut import CutSource
     from beags_plugin.masks.sources.salient import SalientSource
     from beags_plugin.objects.make_masks import make_masks
+    from beags_plugin.runs.run import Run
 
     if (folder / COMPLETE).exists():
         os.utime(folder / COMPLETE)
@@ -100,7 +101,8 @@ def make_masks_once(found: FoundCapture, kind: str, folder: Path, run: Path | No
     source = SalientSource() if kind == SALIENT else CutSource(found.capture.prompts.absolute())
     shutil.rmtree(folder, ignore_errors=True)
     with quiet():
-        lines = make_masks(found.photos.parser(), source, run, folder, overwrite=True)
+        opened = None if run is None else Run(run)
+        lines = make_masks(found.photos.parser(), source, opened, folder, overwrite=True)
     with writing(folder):
         (folder / COMPLETE).touch()
     _remove_old(sorted(folder.parent.glob(f"{found.capture.name}-{kind}-*/{COMPLETE}")))
