@@ -18,6 +18,7 @@ from typing import Any
 
 from beags_benchmarks.experiments.report import number, write_json
 from beags_benchmarks.experiments.results import MEAN
+from beags_plugin.evaluation.metrics import mean
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.whole_files import write_text_atomically
 
@@ -277,22 +278,29 @@ def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def lines_of(table: PageTable, folder: Path) -> str:
-    """Return a table in Markdown from the files of ``folder``; raises ``UserError`` for missing rows."""
+    """Return a table in Markdown, of means over seeds, from the files of ``folder``.
+
+    Raises ``UserError`` for missing rows.
+    """
     lines = [[table.corner, *table.columns], ["---"] * (1 + len(table.columns))]
     for name in table.rows:
         cells = []
         for file, scene, (figure, digits, factor) in table.columns.values():
-            row = _row_of(folder / f"{file}.json", name, scene)
-            cells.append("failed" if row.get("failed") else number(row.get(figure), digits, factor))
+            rows = _rows_of(folder / f"{file}.json", name, scene)
+            figures = [row.get(figure) for row in rows]
+            failed = any(row.get("failed") for row in rows)
+            cells.append("failed" if failed else number(None if None in figures else mean(figures), digits, factor))
         lines.append([f"`{name}`" if name.startswith("beags") and " " not in name else name, *cells])
     return "".join(f"| {' | '.join(line)} |\n".replace("|  |", "| |") for line in lines)
 
 
-def _row_of(path: Path, name: str, scene: str) -> Mapping[str, Any]:
-    for row in json.loads(path.read_text())["rows"]:
-        if (row["variant"], row["scene"], row.get("object", MEAN)) == (name, scene, MEAN):
-            return row
-    raise UserError(f"{path} has no figures of {name!r} on {scene!r}: name a whole result of beags bench.")
+def _rows_of(path: Path, name: str, scene: str) -> list[Mapping[str, Any]]:
+    """Return the rows of a variant on a scene, one for each seed."""
+    rows = json.loads(path.read_text())["rows"]
+    wanted = [row for row in rows if (row["variant"], row["scene"], row.get("object", MEAN)) == (name, scene, MEAN)]
+    if not wanted:
+        raise UserError(f"{path} has no figures of {name!r} on {scene!r}: name a whole result of beags bench.")
+    return wanted
 
 
 def write_tables(root: Path = ROOT) -> None:
