@@ -10,15 +10,19 @@ from typing import Any
 import numpy as np
 
 from beags_plugin.commands.answers import read_object
+from beags_plugin.commands.demo_again import Again
 from beags_plugin.commands.photo_coverage import Coverage
 from beags_plugin.commands.scene_setup import MadeScene
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.masks.separate_things import Things
 from beags_plugin.system.pasted import quoted
+from beags_plugin.system.wording import amount, verb
 
 SURE, FAIR = 0.9, 0.75  # Least agreement between the views for "sure" and "fairly sure".
 MANY = 0.1  # With a larger share of masks overruled as a whole, the demo is not sure.
 FAR, SOME = 0.2, 0.05  # With a larger share of masks that contradict the others by more than FAR, it is not "sure".
+OF_AGREEMENT = ("agreement", "masks", "overruled", "misplaced", "doubtful")
+FEWEST = 3  # Masks with an object that can be compared.
 NAMED = 6  # Photos named in a sentence.
 MOST = 12  # Files named in a command.
 SMALL = 150  # An object whose longer side has fewer pixels shows no printed text.
@@ -39,12 +43,12 @@ class Certainty:
 
 
 def certainty(
-    run: Path, scene: MadeScene, again: str = "beags demo", apart: Path | None = None, seen: Coverage | None = None
+    run: Path, scene: MadeScene, again: Again, apart: Path | None = None, seen: Coverage | None = None
 ) -> Certainty:
     """Judge a finished demo.
 
-    run: its run. scene: of its photos, with poses.json if poses were computed. again: the demo's command without
-    --pick and --fresh. apart: the folder of the masks of separated things, with the report on their agreement. seen:
+    run: its run. scene: of its photos, with poses.json if poses were computed. again: the demo's command.
+    apart: the folder of the masks of separated things, with the report on their agreement. seen:
     what the photos show.
     """
     lines, figures = [], {}
@@ -52,11 +56,11 @@ def certainty(
     agreement = read_object(apart / "report.json") if apart else prepared.get("agreement")
     level = "not judged" if agreement is None else _level(agreement)
     if agreement is not None:
-        figures["agreement"] = {name: agreement[name] for name in ("agreement", "masks", "overruled", "doubtful")}
+        figures["agreement"] = {name: agreement[name] for name in OF_AGREEMENT if name in agreement}
         lines.append(_of_masks(level, agreement, left_out=apart is None))
     elif scene.mended:
         lines.append(
-            "How sure: not judged, since you repainted some of the network's masks, so all are taken as they are."
+            "How sure: not judged, as the masks are no longer those that the network made: all count as they are."
         )
     things = None if agreement is None or "things" not in agreement else Things(**agreement["things"])
     if things is not None:
@@ -77,36 +81,42 @@ def certainty(
         figures["object pixels"] = [width, height]
         subject = "The object has" if len({class_id for class_id, _ in boxes}) == 1 else "Objects have"
         where = "close-ups" if magnified > 1 else "photos"
-        small = max(width, height) < SMALL and magnified == 1
-        end = ". For more detail train on the whole photos:" if small else "."
+        larger = again.larger() if max(width, height) < SMALL and magnified == 1 else None
+        end = ". If your photos are larger, train on them at their full size:" if larger else "."
         lines.append(f"{subject} about {width} x {height} pixels in the {where} that training saw{end}")
-        lines += [f"    {again} --downscale 1 --fresh"] if small else []
+        lines += [f"    {larger} --fresh"] if larger else []
     if agreement is not None:
         lines += _next(again, agreement, scene)
     return Certainty(level, lines, figures)
 
 
 def _level(agreement: dict[str, Any]) -> str:
-    masks = max(agreement["masks"], 1)
+    masks = agreement["masks"]
+    if masks < FEWEST:
+        return "not judged"
     overruled, far = len(agreement["overruled"]) / masks, len(_far(agreement)) / masks
     if agreement["agreement"] < FAIR or overruled > MANY:
         return "not sure"
     return "sure" if agreement["agreement"] >= SURE and not overruled and far <= SOME else "fairly sure"
 
 
-def _far(agreement: dict[str, Any]) -> list[str]:
+def _far(agreement: dict[str, Any]) -> set[str]:
     """Return the views whose masks contradict the others by more than ``FAR``."""
-    return [each["view"] for each in agreement["views"] if (each["contradicts"] or 0.0) > FAR]
+    return {each["view"] for each in agreement["views"] if (each["contradicts"] or 0.0) > FAR}
 
 
 def _of_masks(level: str, agreement: dict[str, Any], left_out: bool) -> str:
     """Return how sure the result is. left_out: whether training left out pixels in doubt, not only votes on them."""
+    masks, overruled = agreement["masks"], agreement["overruled"]
+    if masks < FEWEST:
+        return f"How sure: {level}, as only {amount(masks, 'mask', 'show')} an object."
     line = f"How sure: {level}. The views agree on {100 * agreement['agreement']:.0f} % of what they call the object"
-    masks, far = agreement["masks"], len(_far(agreement))
-    if agreement["overruled"]:
-        line += f"; {len(agreement['overruled'])} of {masks} masks were overruled as a whole"
-    if far > SOME * masks:
-        line += f"; {far} of {masks} contradict the others on more than {100 * FAR:.0f} %"
+    if overruled:
+        line += f"; {len(overruled)} of {masks} masks {'was' if len(overruled) == 1 else 'were'} overruled as a whole"
+    others = len(_far(agreement) - {*overruled, *agreement.get("misplaced", [])})
+    if others > SOME * masks:
+        more = " more" if overruled else ""
+        line += f"; {others}{more} {verb(others, 'contradict')} the others on over {100 * FAR:.0f} %"
     doubt = f"{100 * agreement['doubtful']:.1f} % of all pixels are in doubt"
     return f"{line}; {doubt}{' and were left out' if left_out else ''}."
 
@@ -118,11 +128,11 @@ def _without_poses(without: int, photos: int, names: list[str]) -> str:
     return f"{without} of {photos} photos {verb} no pose and {end}{f' ({named})' if named else ''}."
 
 
-def _next(again: str, agreement: dict[str, Any], scene: MadeScene) -> list[str]:
+def _next(again: Again, agreement: dict[str, Any], scene: MadeScene) -> list[str]:
     """Return what the user can do, with commands to paste."""
     lines = [
-        "Only agreement is judged. If the object is not what you meant, pick it by a few clicks:",
-        f"    {again} --pick --fresh",
+        "Masks that agree may still mark something else than you meant. To pick it by a few clicks:",
+        f"    {again.picking()} --fresh",
     ]
     if (masks := scene.made_masks) is not None and agreement["overruled"]:
         names = [quoted(masks / f"{name}.png") for name in agreement["overruled"][:MOST]]
@@ -132,10 +142,10 @@ def _next(again: str, agreement: dict[str, Any], scene: MadeScene) -> list[str]:
                   f"    rm {' '.join(names)}", f"    {again} --fresh"]  # fmt: skip
     if misplaced := agreement.get("misplaced"):
         names = ", ".join(misplaced[:MOST]) + (" ..." if len(misplaced) > MOST else "")
-        photos, masks = ("photo seems", "its mask fits") if len(misplaced) == 1 else ("photos seem", "their masks fit")
+        fit = "its mask fits" if len(misplaced) == 1 else "their masks fit"
         lines.append(
-            f"{len(misplaced)} {photos} to have a wrong pose ({names}): {masks} the object only when shifted. It may "
-            "be sharper without them: take them out of your photos, and run the demo again with another --output."
+            f"{amount(len(misplaced), 'photo', 'seem')} to have a wrong pose ({names}): {fit} the object only when "
+            "shifted. Without such photos the object may be sharper: run the demo on the others, with another --output."
         )
     return lines
 

@@ -52,7 +52,7 @@ class Demo:
     fresh: bool = False
     """Train again even if the same demo has been trained before."""
     strict: bool = False
-    """Stop where masks contradict one another, before anything is trained."""
+    """Stop where masks contradict one another, before anything is trained; at the end, fail if it is not sure."""
     pick: bool = False
     """Click on the objects in the viewer, which opens once the base is trained; the demo continues once they are saved.
     With --fresh they are picked again, on the same base."""

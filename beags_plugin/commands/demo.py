@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from beags_plugin.commands.answers import CONSOLE
+from beags_plugin.commands.demo_again import Again
 from beags_plugin.commands.demo_picks import (
     APART,
     check_one_object,
@@ -23,9 +24,10 @@ from beags_plugin.commands.demo_picks import (
 from beags_plugin.commands.demo_training import STARTED, read_stamp, train_once
 from beags_plugin.system.digests import code_digest, value_digest
 from beags_plugin.system.errors import UserError, check_choice
-from beags_plugin.system.pasted import command, quoted
+from beags_plugin.system.pasted import quoted
 from beags_plugin.system.progress import progress_bar, timed
 from beags_plugin.system.whole_files import write_text_atomically
+from beags_plugin.system.wording import amount
 
 if TYPE_CHECKING:
     from beags_plugin.commands.certainty import Certainty
@@ -56,7 +58,7 @@ def run_demo(
     from beags_plugin.data.quick import quick_downscale
     from beags_plugin.sample.writer import SampleConfig, make_sample
 
-    again = _again(data, output, preset, downscale, objects)
+    again = Again(data, output, preset, downscale, objects, pick, mask_source, mask_options, seed)
     preset = preset or (PRESET if data is None else PRESET_OF_PHOTOS)
     check_preset(preset)
     if downscale is not None and not 1.0 <= downscale < math.inf:
@@ -79,7 +81,7 @@ def run_demo(
         how = {"pick": True} if pick else {"objects": objects} if objects > 1 else {}
         check_trained_otherwise(output, fresh, how)
         with timed(seconds, "poses" if pick else "poses and masks"):
-            scene = made_scene(data, output, not pick, chosen.below(data))
+            scene = made_scene(data, output, not pick, chosen.below(output / "scene").below(data))
         if objects > 1 and not pick:
             check_one_object(scene, data)
         if strict:
@@ -92,7 +94,7 @@ def run_demo(
         names = names_of(data, objects)
         scene = _trained_on_base(
             scene, output, request, fresh, seconds, {"pick": True},
-            lambda base: picked_scene(scene, base, names, fresh, f"{again} --pick"),
+            lambda base: picked_scene(scene, base, names, fresh, again.picking()),
         )  # fmt: skip
     elif objects > 1 and not scene.turned:
         scene = _trained_on_base(
@@ -106,7 +108,7 @@ def run_demo(
     sure = measure(output / "run", output, seconds, scene, again)
     if pick:
         CONSOLE.print(
-            f"If the objects are not what you meant, pick them again on the same base:\n    {again} --pick --fresh"
+            f"If the objects are not what you meant, pick them again on the same base:\n    {again.picking()} --fresh"
         )
     if strict and sure.level == "not sure":
         raise UserError(
@@ -182,14 +184,6 @@ def _check_objects(data: Path | None, pick: bool, objects: int, strict: bool) ->
         raise UserError("the sample has masks of its objects: name photos with --data, or leave --objects out.")
 
 
-def _again(data: Path | None, output: Path | None, preset: str | None, downscale: float | None, objects: int) -> str:
-    """Return the command of this demo, without --pick and --fresh."""
-    words = ["beags", "demo", *([] if data is None else ["--data", str(data)])]
-    for name, value in (("output", output), ("preset", preset), ("downscale", downscale)):
-        words += [] if value is None else [f"--{name}", str(value)]
-    return command([*words, *([] if objects == 1 else ["--objects", str(objects)])])
-
-
 def check_contradictions(scene: MadeScene, output: Path) -> None:
     """Raise ``UserError`` where masks contradict the other views at shared points (``beags masks check``).
 
@@ -206,9 +200,13 @@ def check_contradictions(scene: MadeScene, output: Path) -> None:
         written = write_contradictions(report, output)
         see = f"; see {written[0]}" if written else ""
         named = ", ".join(views[:6]) + (f" and {len(views) - 6} more" if len(views) > 6 else "")
-        which = f"the mask of {views[0]} contradicts" if len(views) == 1 else f"{len(views)} masks contradict"
-        raise UserError(f"{which} the others ({named}{see}): correct or delete them, or leave --strict out.")
-    CONSOLE.print(report.compared or "The masks are too few, or hold no object, so they were not compared.")
+        contradict = amount(len(views), "mask", "contradict")
+        raise UserError(f"{contradict} the others ({named}{see}): correct or delete them, or leave --strict out.")
+    if not report.tracked:
+        CONSOLE.print(
+            "Without points of COLMAP's, only inverted and exchanged masks are found before training; the others "
+            "decide at the end how sure the result is."
+        )
 
 
 def check_preset(preset: str) -> None:
@@ -229,14 +227,12 @@ def inputs_digest(scene: MadeScene, output: Path, preset: str) -> str:
     return value_digest([*scene.digests(output), code_digest(), *texts])
 
 
-def measure(
-    run: Path, output: Path, seconds: dict[str, float], scene: MadeScene, again: str = "beags demo"
-) -> Certainty:
+def measure(run: Path, output: Path, seconds: dict[str, float], scene: MadeScene, again: Again) -> Certainty:
     """Compare assignment alone with refinement, extract every object, write summary.json and the pictures.
 
     Returns how sure the result is, which it also prints.
 
-    again: the demo's command without --pick and --fresh.
+    again: the demo's command.
     """
     from beags_plugin.commands.certainty import certainty, write_doubt
     from beags_plugin.commands.photo_coverage import coverage

@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from beags_plugin.core.surfels import Surfels
     from beags_plugin.objects.evaluate import EvaluatedRun
 
-LEVEL = 10.0  # degrees above the horizon of the sides that are asked about
 LEAST = 60  # degrees about an object without a photo that are worth a sentence
 NAMED = 6  # photos named in a sentence
 
@@ -37,11 +36,11 @@ class Coverage:
         if self.veiled:
             names = ", ".join(self.veiled[:NAMED]) + (" ..." if len(self.veiled) > NAMED else "")
             lines.append(
-                f"Of the {self.held_out} photos kept out of training, a veil hides the object in {len(self.veiled)} "
-                f"({names}): more photos from near there would remove it."
+                f"In {len(self.veiled)} of {self.held_out} photos kept out of training ({names}), something hides the "
+                "object that photos beside them do not show: more photos from there may remove it."
             )
         lines += [
-            f"No photo shows {name} over about {degrees} of the 360 degrees around it: there its shape is a guess."
+            f"About {degrees} of the 360 degrees around {name} are in no photo: there its shape is a guess."
             for name, degrees in self.unshown.items()
             if degrees >= LEAST
         ]
@@ -63,7 +62,7 @@ def coverage(run: EvaluatedRun, objects: Mapping[int, Mapping[str, Surfels]]) ->
         whole = [part for part in stages.values() if len(part)]
         if whole:
             stand = orbit_frame(*bounding_box(whole[-1]), cameras)
-            degrees[run.classes.get(class_id, f"object {class_id}")] = unshown(stand, cameras, LEVEL)
+            degrees[run.classes.get(class_id, f"object {class_id}")] = unshown(stand, cameras)
     held_out = dict(zip(run.views.names, run.views.cameras("eval"), strict=True))
     alone = run.objects_alone  # Then nothing but the objects was trained.
     parts = scene.surfels(), scene.members, list(objects)

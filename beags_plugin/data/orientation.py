@@ -92,6 +92,6 @@ def turned_note(photos: Sequence[Path]) -> str | None:
         return None
     photo, turned = stored[0]
     return (
-        f"{amount(len(stored), 'photo', 'are')} stored turned, the first of them {photo} with EXIF orientation "
-        f"{turned}: masks must lie as the photos are stored; turn upright ones with beags masks make --upright."
+        f"{amount(len(stored), 'photo', 'are')} stored turned (first {photo}, with EXIF orientation "
+        f"{turned}): masks must lie as the photos are stored; turn upright ones with beags masks make --upright."
     )

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
 
 from beags_plugin.core.cameras import Camera
@@ -16,8 +16,8 @@ from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
 
 VEILED = 0.1
-"""Share of the objects' pixels that is hidden in a held-out photo beyond the median of training photos: a veil."""
-SAMPLED = 12  # training photos of that median
+"""Share of the objects' pixels that is hidden in a held-out photo, beyond the most in the training photos beside it."""
+BESIDE = 6  # training photos, the nearest ones
 HALF = 0.5  # alpha, and share of a pixel's light, from which a pixel belongs to an object
 
 
@@ -30,22 +30,32 @@ def veiled(
     rasterizer: Rasterizer,
     settings: RasterSettings,
 ) -> list[str]:
-    """Return the names of held-out photos in which something hides the objects that training photos do not show there.
+    """Return the names of held-out photos in which something hides the objects that training photos beside them show.
 
     objects: their ids. held_out: name to camera. training: cameras of the training photos. It needs no ground truth:
-    where an object drawn alone covers a pixel, the whole scene should give the pixel to an object, but for things that
-    hide it in all photos.
+    where an object drawn alone covers a pixel, the whole scene should give the pixel to an object. What stands before
+    it hides it in one of the ``BESIDE`` nearest training photos too.
     """
+    if not objects or not training:
+        return []
+    shares: dict[int, float] = {}
 
     def hidden(camera: Camera) -> float:
         return hidden_share(surfels, members, objects, camera, rasterizer, settings)
 
-    if not objects:
-        return []
-    step = max(len(training) // SAMPLED, 1)
-    usual = [share for camera in training[::step] if not np.isnan(share := hidden(camera))]
-    most = VEILED + (float(np.median(usual)) if usual else 0.0)
-    return [name for name, camera in held_out.items() if hidden(camera) > most]
+    def usual(view: int) -> float:
+        if view not in shares:
+            shares[view] = hidden(training[view])
+        return shares[view]
+
+    centers = torch.stack([camera.center for camera in training]).double()
+    found = []
+    for name, camera in held_out.items():
+        if (share := hidden(camera)) > VEILED:
+            nearest = (centers - camera.center.double()).norm(dim=1).argsort()[:BESIDE].tolist()
+            most = max((each for view in nearest if not math.isnan(each := usual(view))), default=0.0)
+            found += [name] if share > most + VEILED else []
+    return found
 
 
 @torch.no_grad()

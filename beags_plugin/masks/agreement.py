@@ -147,6 +147,7 @@ class _Votes:
         settings = replace(settings, geometry=False, distortion=False)
         self._count, self._classes = len(surfels), num_classes
         self._views: list[tuple[np.ndarray, np.ndarray] | None] = []
+        self._areas = np.array([float(camera.K[0, 0] * camera.K[1, 1]) for camera in cameras])
         for index, (camera, mask) in enumerate(zip(cameras, labels, strict=True)):
             if mask is None:
                 self._views.append(None)
@@ -179,8 +180,9 @@ class _Votes:
             of_objects = known[gaussians] & ((classes != BACKGROUND) | (agreed[gaussians] != BACKGROUND))
             seen[index] = float(light[of_objects].sum())
             wrong[index] = float(light[of_objects & (classes != agreed[gaussians])].sum())
-        trace = TRACE * float(np.median(seen[self.shows_object])) if self.shows_object.any() else 0.0
-        least = np.where(self.shows_object, 0.0, trace)
+        # Close-ups hold more light of the same object than whole photos: areas are compared at one focal length.
+        usual = np.median((seen / self._areas)[self.shows_object]) if self.shows_object.any() else 0.0
+        least = np.where(self.shows_object, 0.0, TRACE * usual * self._areas)
         return np.divide(wrong, seen, out=np.full(len(seen), np.nan), where=seen > least)
 
     def weights(self, errors: np.ndarray) -> np.ndarray:

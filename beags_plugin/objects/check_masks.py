@@ -48,7 +48,8 @@ class Report:
 
     names: class id to name. trained: False for held-out views. contradictions: views whose masks the others contradict,
     the worst first, at tracked points, then, with a trained run, at its depths, in ``areas``. compared: a sentence on
-    the tracked points. pointed, framed: the worst views at points and in areas, for ``contradicted_picture``.
+    the tracked points. tracked: whether there are any. pointed, framed: the worst views at points and in areas, for
+    ``contradicted_picture``.
     """
 
     data: Path
@@ -60,6 +61,7 @@ class Report:
     contradictions: list[Contradiction] = field(default_factory=list)
     areas: list[Area] = field(default_factory=list)
     compared: str = ""
+    tracked: bool = False
     pointed: list[Pointed] = field(default_factory=list)
     framed: list[tuple[Changed, list[tuple[int, int, int, int]]]] = field(default_factory=list)
 
@@ -194,6 +196,7 @@ def _files(config: DataOptions) -> tuple[Dataset, PosedViews, MaskFiles]:
 
 def _add_points(report: Report, files: MaskFiles, views: PosedViews, tracks: Tracks, seen: Agreement) -> None:
     """Add the contradictions at points that several views saw."""
+    report.tracked = len(seen.labels) > 0
     report.compared = (
         f"Views were compared at {len(seen.labels)} points of the COLMAP model, each in the views that saw it."
         if len(seen.labels)

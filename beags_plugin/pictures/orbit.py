@@ -16,7 +16,8 @@ from beags_plugin.rasterizers.interface import RasterSettings
 _FIELD_OF_VIEW = math.radians(35.0)
 _MARGIN = 1.06  # factor on the box in the widest picture of the turn, as discs reach beyond the box
 _STEP = 5  # degrees between candidate sides
-_FACING = 60.0  # most degrees between a side and a photo that shows it
+_FACING = 60.0  # most degrees about the up axis between a side and a photo that shows it
+_STEEP = 0.34  # share of its way that a camera is beside the object, below which it is 70 degrees above or below
 _NEAR, _FAR = 0.02, 100.0  # depth range, in distances to the centre
 
 
@@ -95,27 +96,31 @@ def least_shown(stand: OrbitFrame, cameras: Sequence[Camera], elevation: float) 
 
     cameras: the photos' cameras. Without any that has the centre in its picture, the azimuth is 180.
     """
-    nearest = _nearest(stand, cameras, elevation)
-    return 180.0 if nearest is None else float(_STEP * int(nearest.argmin()))
-
-
-def unshown(stand: OrbitFrame, cameras: Sequence[Camera], elevation: float) -> int:
-    """Return over how many of the 360 degrees about the up axis no photo shows the object from within 60 degrees.
-
-    cameras, elevation: as in ``least_shown``.
-    """
-    nearest = _nearest(stand, cameras, elevation)
-    return 360 if nearest is None else _STEP * int((nearest < math.cos(math.radians(_FACING))).sum())
-
-
-def _nearest(stand: OrbitFrame, cameras: Sequence[Camera], elevation: float) -> Tensor | None:
-    """Return the cosine of the angle of each side, ``_STEP`` degrees apart, to the nearest camera; None without any."""
     showing = [camera for camera in cameras if shows(camera, stand.center)]
     if not showing:
-        return None
+        return 180.0
     aways = torch.stack([camera.center for camera in showing]).double() - stand.center
     sides = torch.stack([side(stand, azimuth, elevation) for azimuth in range(0, 360, _STEP)])
-    return (sides @ torch.nn.functional.normalize(aways, dim=1).T).amax(dim=1)
+    nearest = (sides @ torch.nn.functional.normalize(aways, dim=1).T).amax(dim=1)
+    return float(_STEP * int(nearest.argmin()))
+
+
+def unshown(stand: OrbitFrame, cameras: Sequence[Camera]) -> int:
+    """Return how many of the 360 degrees about the up axis are farther than 60 degrees from all photos.
+
+    cameras: the photos' cameras. One that looks steeply down or up shows all sides. 0 if none has the centre in its
+    picture, as then no side is better known than another.
+    """
+    showing = [camera for camera in cameras if shows(camera, stand.center)]
+    if not showing:
+        return 0
+    aways = torch.stack([camera.center for camera in showing]).double() - stand.center
+    level = aways - (aways @ stand.up)[:, None] * stand.up
+    if bool((level.norm(dim=1) < _STEEP * aways.norm(dim=1)).any()):
+        return 0
+    sides = torch.stack([side(stand, azimuth, 0.0) for azimuth in range(0, 360, _STEP)])
+    nearest = (sides @ torch.nn.functional.normalize(level, dim=1).T).amax(dim=1)
+    return _STEP * int((nearest < math.cos(math.radians(_FACING))).sum())
 
 
 def view_from(stand: OrbitFrame, away: Tensor, pixels: int, room: float = 1.0) -> Camera:

@@ -73,13 +73,14 @@ class AgreementReport:
         count = sum(error is not None for error in self.errors)
         line = f"the views agree on {100 * self.agreement:.0f} % of what they call an object"
         if self.overruled:
-            line += f"; {len(self.overruled)} of {count} masks were overruled as a whole"
+            were = "was" if len(self.overruled) == 1 else "were"
+            line += f"; {len(self.overruled)} of {count} masks {were} overruled as a whole"
             line += "" if names is None else _named(self.overruled, names)
         if self.misplaced:
-            line += f"; {len(self.misplaced)} of {count} masks do not fit because the poses of their photos are wrong"
+            line += f"; the photos of {len(self.misplaced)} of {count} masks seem to have wrong poses"
             line += "" if names is None else _named(self.misplaced, names)
         changed, doubtful = (100 * float(np.mean(share)) for share in (self.changed, self.doubtful))
-        return f"{line}; {changed:.2f} % of all pixels got another class, {doubtful:.2f} % are in doubt and left out"
+        return f"{line}; {changed:.2f} % of all pixels got another class, {doubtful:.2f} % are in doubt"
 
 
 def _named(views: Sequence[int], names: Sequence[str]) -> str:

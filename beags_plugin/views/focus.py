@@ -15,8 +15,8 @@ import torch
 from rich.progress import track
 from torch import Tensor
 
-from beags_plugin.data.files import image_size
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE, count_ids
+from beags_plugin.labels.classes import read_mask
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
 from beags_plugin.views.close_ups import MOST_BYTES, CloseUps, kept_pixels, kept_size, read_close_ups
@@ -156,19 +156,21 @@ def _lost(files: PhotoFiles, found: set[int]) -> str | None:
     found: ids of the objects that photos show at that size. Masks are read again only if an object of ``classes`` is
     missing.
     """
-    missing = files.dataset.metadata["classes"].keys() - found - {BACKGROUND}
+    metadata = files.dataset.metadata
+    missing = metadata["classes"].keys() - found - {BACKGROUND}
     lost: set[int] = set()
-    for photo, file in enumerate(files.dataset.image_filenames):
-        if missing <= lost:
-            break
-        lost |= missing & set(np.unique(files.dataset.get_labels(photo, *image_size(file))).tolist())
+    for mask in track(metadata["mask_filenames"] if missing else [], "Looking for small objects", transient=True):
+        if mask is not None and not missing <= lost:
+            ids = read_mask(mask, metadata["mask_kind"], metadata["ignore_ids"])
+            lost |= missing & set(np.flatnonzero(np.bincount(ids.ravel())).tolist())
     if not lost:
         return None
-    names = ", ".join(files.dataset.metadata["classes"][each] for each in sorted(lost))
+    names = ", ".join(metadata["classes"][each] for each in sorted(lost))
+    of_it, small, lies = ("it", "it is", "lies") if len(lost) == 1 else ("them", "they are", "lie")
     return (
-        f"No photo shows {names} at the size of the training, so there will be no close-ups and no Gaussians of it: "
-        "it is too small (a lower --downscale-factor keeps more of the photos), or lies where removing the lens "
-        "distortion cuts the photos off."
+        f"No photo shows {names} at the size of the training, so there will be no close-ups and no Gaussians of "
+        f"{of_it}: {small} too small (a lower --downscale-factor keeps more of the photos), or {lies} where removing "
+        "the lens distortion cuts the photos off."
     )
 
 

@@ -221,7 +221,7 @@ def test_agreement_overrules_the_mask_that_contradicts_the_others(tmp_path, caps
     config = write_trained(tmp_path / "run", data, assigned=False)
     main(["masks", "agree", "--load-config", str(config), "--output", str(tmp_path / "agreed")])
     out = " ".join(capsys.readouterr().out.split())
-    assert "1 of 7 masks were overruled as a whole (v03)" in out and "--masks-path" in out
+    assert "1 of 7 masks was overruled as a whole (v03)" in out and "--masks-path" in out
     report = json.loads((tmp_path / "agreed/report.json").read_text())
     assert report["overruled"] == ["v03"] and (tmp_path / "agreed/doubt.png").exists()
     for name in sorted(set(names[1:8])):

@@ -61,8 +61,9 @@ def test_a_veil_before_a_held_out_camera_is_found(views):
     assert found(views) == [f"v{view}" for view in views]
 
 
-def test_what_hides_objects_in_training_photos_too_is_no_veil():
+def test_what_hides_objects_in_training_photos_beside_it_too_is_no_veil():
     assert found((0, 1, 2, 3, 4, 5, 6, 7)) == []
+    assert found((0, 1)) == [], "a thing on one side"
 
 
 def test_objects_hide_one_another_and_a_class_without_gaussians_has_no_share():

@@ -12,6 +12,7 @@ from random_surfels import camera_at
 from touching_solids import SETTINGS, solids, views
 
 from beags_plugin.assignment.contributions import contributions
+from beags_plugin.core.cameras import cropped
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import LabelMaps
@@ -19,6 +20,7 @@ from beags_plugin.masks.agreement import SILENT, AgreedMask, Agreement, agreed_m
 from beags_plugin.preparation.agreed import agree
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import render_class_map
+from beags_plugin.views.cameras import small_camera
 
 COLOURS = {0: (0.6, 0.6, 0.6), 1: (0.8, 0.2, 0.2), 2: (0.2, 0.3, 0.8)}
 CAMERAS = views(12)
@@ -156,6 +158,25 @@ def test_an_object_that_only_shines_into_a_view_is_not_missed_by_its_empty_mask(
     exact = of(scene[3], 2)
     found, _ = agreed(scene, [*exact, mask], cameras=[*CAMERAS, camera])
     assert np.isnan(found.errors[-1]) and found.silenced == []
+
+
+def test_an_empty_mask_that_misses_a_small_part_is_wrong_whether_close_ups_follow_or_not(scene):
+    """Close-ups hold far more light of the object, from which no whole photo may seem to show nothing of it."""
+    for turn in np.arange(0.2, 1.2, 0.01):
+        eye, target = (2.2, 0.0, 1.2), (2.2 - 1.5 * math.cos(turn), 1.5 * math.sin(turn), 0.2)
+        camera = camera_at(eye, torch.tensor(target), pixels=96)
+        (mask,) = drawn(scene, [camera])
+        if int(mask.sum()) < 50:
+            break
+    assert int(mask.sum()) > 20
+    close_ups = [
+        small_camera(cropped(small_camera(each, (432, 432)), 156, 156, 120, 120), (120, 120)) for each in CAMERAS
+    ]
+    exact = of(scene[3], 2)
+    for further in ([], close_ups, 2 * close_ups):
+        given = [*exact, torch.zeros_like(mask), *drawn(scene, further)]
+        found, _ = agreed(scene, given, cameras=[*CAMERAS, camera, *further])
+        assert found.errors[12] == 1.0 and found.silenced == [12]
 
 
 def test_a_class_of_which_gaussians_are_not_certain_is_left_out(scene):

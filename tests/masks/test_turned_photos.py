@@ -107,7 +107,7 @@ def test_the_check_notes_photos_that_are_turned_within_their_size(tmp_path, turn
     write_masks(root / "masks", mask())
     cli.main(["masks", "check", "--data", str(root)])
     said = " ".join(capsys.readouterr().out.split())
-    assert f"9 photos are stored turned, the first of them {root}/images/v00.png with EXIF orientation {turned}" in said
+    assert f"9 photos are stored turned (first {root}/images/v00.png, with EXIF orientation {turned})" in said
     assert "beags masks make --upright" in said
 
 

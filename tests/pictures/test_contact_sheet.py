@@ -230,10 +230,12 @@ def test_the_side_least_shown_is_the_one_without_photos():
     for gap in (40.0, 180.0, 300.0):
         seen = [view_from(stand, side(stand, gap + turn, 25.0), 32) for turn in range(50, 311, 20)]
         assert least_shown(stand, seen, 10.0) == pytest.approx(gap, abs=5)
-        assert unshown(stand, seen, 10.0) == 0
-        some = [view_from(stand, side(stand, gap + turn, 10.0), 32) for turn in range(120, 241, 20)]
-        assert unshown(stand, some, 10.0) == pytest.approx(360 - 120 - 2 * 60, abs=10)
-    assert least_shown(stand, [], 10.0) == 180.0 and unshown(stand, [], 10.0) == 360
+        assert unshown(stand, seen) == 0
+        for elevation in (0.0, 50.0):
+            some = [view_from(stand, side(stand, gap + turn, elevation), 32) for turn in range(120, 241, 20)]
+            assert unshown(stand, some) == pytest.approx(360 - 120 - 2 * 60, abs=10)
+        assert unshown(stand, [view_from(stand, side(stand, gap, 80.0), 32)]) == 0, "from above it sees all sides"
+    assert least_shown(stand, [], 10.0) == 180.0 and unshown(stand, []) == 0
     away = [cropped(seen, 500, 0, 32, 32) for seen in orbit(stand, 4, 32)]
     assert least_shown(stand, away, 10.0) == 180.0
 

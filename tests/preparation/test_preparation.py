@@ -82,7 +82,7 @@ def test_the_report_of_agreement_holds_no_nan_and_names_misplaced_views():
     assert written["views"][1]["contradicts"] is None
     first = report.of_first(3)
     assert first.misplaced == [] and first.overruled == [2] and len(first.errors) == 3
-    assert "1 of 3 masks do not fit because the poses of their photos are wrong (d)" in report.sentence(list("abcd"))
+    assert "the photos of 1 of 3 masks seem to have wrong poses (d)" in report.sentence(list("abcd"))
     assert "poses" not in first.sentence()
 
 

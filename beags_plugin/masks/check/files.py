@@ -207,8 +207,8 @@ def _strays(files: MaskFiles) -> Iterator[Issue]:
             "warning",
             "unused",
             f"{amount(len(others), 'file')} in {files.folder} {verb(len(others), 'are')} not used "
-            f"({named([path.name for path in others], 3)}), as {why}: rename them after their "
-            "images or save them as .png; those of photos without a pose may stay.",
+            f"({named([path.name for path in others], 3)}), as {why}: give each the name of "
+            "its image, as .png; those of photos without a pose may stay.",
             "training does not use them",
         )
 
