@@ -230,10 +230,11 @@ def test_a_trained_scene_is_rendered_whole_cropped_and_by_object(trained):
 def test_demo_on_a_folder_writes_table_figures_and_picture(trained, data, tmp_path):
     """The measuring half of the demo, on the run that is there."""
     from beags_plugin.commands.demo import measure
+    from beags_plugin.commands.demo_again import Again
     from beags_plugin.commands.scene_setup import MadeScene
 
     folder, _ = trained
-    measure(folder, tmp_path, {}, MadeScene(data))
+    measure(folder, tmp_path, {}, MadeScene(data), Again(data))
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert set(summary) == {"mean", "objects", "psnr", "seconds", "peak_memory_mb", "certainty"}
     for kind in ("extracted", "rendered"):
