@@ -72,6 +72,10 @@ def certainty(
         figures["photos without poses"] = without
         if without:
             lines.append(_without_poses(without, int(posed["photos"]), posed.get("without_pose", [])))
+    if scene.without:
+        figures["left out"] = list(scene.without)
+        names = ", ".join(scene.without[:MOST]) + (" ..." if len(scene.without) > MOST else "")
+        lines.append(f"{len(scene.without)} photos seemed to have a wrong pose and were left out ({names}).")
     if seen is not None:
         figures |= seen.figures()
         lines += seen.lines()

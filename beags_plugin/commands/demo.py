@@ -21,7 +21,7 @@ from beags_plugin.commands.demo_picks import (
     things_apart,
     trained_base,
 )
-from beags_plugin.commands.demo_training import STARTED, read_stamp, train_once
+from beags_plugin.commands.demo_training import STARTED, WITHOUT, read_stamp, train_once
 from beags_plugin.system.digests import code_digest, value_digest
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.pasted import quoted
@@ -104,7 +104,7 @@ def run_demo(
     else:
         if objects > 1:
             CONSOLE.print("As they turned before a room that stands, the things stay one object.")
-        _trained_by_masks(scene, output, request, fresh, GENERATED if data is None else ())
+        scene = _trained_by_masks(scene, output, request, fresh, GENERATED if data is None else ())
     sure = measure(output / "run", output, seconds, scene, again)
     if pick:
         CONSOLE.print(
@@ -119,20 +119,35 @@ def run_demo(
 
 def _trained_by_masks(
     scene: MadeScene, output: Path, request: dict[str, Any], fresh: bool, words: Sequence[str]
-) -> None:
-    """Train a scene with its masks; words: further options of the training."""
+) -> MadeScene:
+    """Train a scene with its masks; words: further options of the training.
+
+    If masks show that a few photos have wrong poses, it is trained again without these; returns the scene that is
+    trained in the end.
+    """
+    from beags_plugin.commands.demo_training import misplaced, without_photos
     from beags_plugin.runs.prepared import photos_contradict
 
     request = {**request, "inputs": inputs_digest(scene, output, request["preset"])}
     alone = {**request, "photos": "objects"}
     if scene.turned or (alone in (former := read_stamp(output), former.get(STARTED)) and not fresh):
         request = alone
+    elif not fresh and (left_out := without_photos(output, request)):
+        scene, request = replace(scene, without=left_out), {**request, WITHOUT: list(left_out)}
     train_once(scene, output, request, fresh, words=words)
-    if request != alone and photos_contradict(output / "run"):
+    if request == alone or scene.without:
+        return scene
+    if photos_contradict(output / "run"):
         CONSOLE.print(
             "The photos contradict each other outside the masks, as on a turntable: now with the objects' pixels alone."
         )
         train_once(scene, output, alone, fresh, replace=True, words=words)
+    elif left_out := misplaced(output / "run"):
+        seem = amount(len(left_out), "photo", "seem")
+        CONSOLE.print(f"{seem} to have a wrong pose ({', '.join(left_out)}): now without them.")
+        scene, request = replace(scene, without=left_out), {**request, WITHOUT: list(left_out)}
+        train_once(scene, output, request, fresh, replace=True, words=words)
+    return scene
 
 
 def _trained_on_base(

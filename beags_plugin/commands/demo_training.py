@@ -21,6 +21,8 @@ from beags_plugin.system.pasted import command, quoted
 from beags_plugin.system.whole_files import write_text_atomically
 
 STAMP = "trained.json"  # This file beside the run holds the request that it was trained for.
+WITHOUT = "without"  # This key of it holds the photos that are left out for their wrong poses.
+FEW, MOST_LEFT_OUT = 2, 0.3  # Least number of photos that are worth another training, and largest share.
 STARTED = "started"  # This key of it holds the request until the training ends.
 AGREE = ("--pipeline.model.prepare.agree", "True")  # A network's masks have the same errors in many views.
 QUIET = ("--logging.steps-per-log", "200", "--logging.local-writer.max-log-size", "0")  # Used if output is no terminal.
@@ -71,6 +73,22 @@ def trained(output: Path, request: dict[str, Any]) -> bool:
     """Return whether the same request was trained to its end."""
     former = read_stamp(output)
     return request in (former, former.get(STARTED)) and (output / "run" / "training.json").exists()
+
+
+def without_photos(output: Path, request: dict[str, Any]) -> tuple[str, ...]:
+    """Return the photos that an earlier training of the same request left out; none if it left out none."""
+    former = read_stamp(output)
+    former = dict(former.get(STARTED, former))
+    names = former.pop(WITHOUT, ())
+    return tuple(names) if former == request else ()
+
+
+def misplaced(run: Path) -> tuple[str, ...]:
+    """Return photos with wrong poses, by the agreement of the masks, if they are few but worth another training."""
+    agreement = read_object(run / "prepared/report.json").get("agreement") or {}
+    names = agreement.get("misplaced", [])
+    few = FEW <= len(names) <= MOST_LEFT_OUT * len(agreement.get("views", []))
+    return tuple(names) if few and not any("/" in name for name in names) else ()
 
 
 def difference(stamp: dict[str, Any], request: dict[str, Any]) -> str:

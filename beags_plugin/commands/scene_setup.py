@@ -34,12 +34,14 @@ class MadeScene:
     """A scene to train on.
 
     data: its folder. labels: the folder with masks/ and classes.json, if it is another one. turned: whether the objects
-    turned while the room stood still, and the poses are those of the objects.
+    turned while the room stood still, and the poses are those of the objects. without: stems of photos with wrong
+    poses, which are not used.
     """
 
     data: Path
     labels: Path | None = None
     turned: bool = False
+    without: tuple[str, ...] = ()
 
     @property
     def made_masks(self) -> Path | None:
@@ -53,11 +55,13 @@ class MadeScene:
         return mended(self.labels or self.data)
 
     def options(self) -> list[str]:
-        """Return the options of ``beags-data`` that name its masks."""
+        """Return the options of ``beags-data`` that name its masks, and photos that are not used."""
+        left_out = ["--leave-out", *self.without] if self.without else []
         if self.labels is None:
-            return []
+            return left_out
         masks, classes = self.mask_paths()
-        return ["--masks-path", str(masks), *(["--classes-path", str(classes)] if classes.exists() else [])]
+        named = ["--classes-path", str(classes)] if classes.exists() else []
+        return [*left_out, "--masks-path", str(masks), *named]
 
     def mask_paths(self) -> tuple[Path, Path]:
         """Return the folder of its masks, and the file of their classes, which may be missing."""

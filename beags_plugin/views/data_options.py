@@ -43,6 +43,8 @@ class DataOptions:
     Splits that the data or its protocol names come first."""
     held_out: tuple[str, ...] = ()
     """Stems of images to hold out for evaluation besides."""
+    leave_out: tuple[str, ...] = ()
+    """Stems of images that are not used at all, such as those with wrong poses."""
     orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
     """How the world is turned."""
     center_method: Suppress[Literal["poses", "none"]] = "poses"

@@ -103,6 +103,13 @@ def test_photos_with_wrong_poses_are_named(tmp_path, names, said):
     assert said in lines[-1]
 
 
+def test_photos_that_were_left_out_are_named(tmp_path):
+    scene = MadeScene(tmp_path, without=("a", "b"))
+    found = certainty(write_run(tmp_path / "run", 0.95, []), scene, Again())
+    assert "2 photos seemed to have a wrong pose and were left out (a, b)." in found.lines
+    assert found.figures["left out"] == ["a", "b"]
+
+
 def test_what_photos_do_not_show_is_said_and_stored(tmp_path):
     seen = Coverage(5, ["v1", "v2"], {"cup": 120, "plate": 30})
     found = certainty(write_run(tmp_path / "run", None, []), MadeScene(tmp_path), Again(), seen=seen)

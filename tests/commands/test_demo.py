@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -163,6 +164,48 @@ def test_photos_of_a_turntable_are_trained_on_again_by_their_objects(tmp_path, m
     assert again() == ["all", "objects"]
     assert again() == ["resume"]
     assert again() == []
+
+
+def left_out_of(command: list[str]) -> list[str]:
+    """Return the photos that a training leaves out."""
+    after = command[command.index("--leave-out") + 1 :] if "--leave-out" in command else []
+    return list(itertools.takewhile(lambda word: not word.startswith("--"), after))
+
+
+def test_photos_with_wrong_poses_are_left_out_of_another_training(tmp_path, monkeypatch):
+    """Once: a second demo takes what was trained, or resumes it; and with --fresh it looks again."""
+    data, run, commands, scenes = write_scene(tmp_path / "data"), tmp_path / "out/run", [], []
+    wrong, killed = ["v01", "v05"], [True]
+
+    def finish(command):
+        commands.append(command)
+        (run / "prepared").mkdir(parents=True, exist_ok=True)
+        (run / "config.yml").touch()
+        views = [{"view": f"v{view:02d}"} for view in range(1, 8) if f"v{view:02d}" not in left_out_of(command)]
+        report = {"views": views, "misplaced": [] if len(views) < 7 else wrong}
+        (run / "prepared/report.json").write_text(json.dumps({"agreement": report}))
+        if left_out_of(command) and killed:
+            killed.pop()
+            raise KeyboardInterrupt
+        (run / "training.json").write_text("{}")
+
+    monkeypatch.setattr(demo_training, "finish", finish)
+    monkeypatch.setattr(demo, "measure", lambda *words: scenes.append(words[3]))
+
+    def again(fresh: bool = False) -> list[object]:
+        commands.clear()
+        with contextlib.suppress(KeyboardInterrupt):
+            demo.run_demo(data, tmp_path / "out", "beags-tiny", None, 0, fresh)
+        return ["resume" if "resume" in command else left_out_of(command) for command in commands]
+
+    assert again() == [[], wrong] and scenes == []
+    assert again() == ["resume"] and scenes[-1].without == ("v01", "v05")
+    assert again() == [] and scenes[-1].without == ("v01", "v05")
+    assert again(fresh=True) == [[], wrong]
+    wrong[:] = ["v01"]
+    assert again(fresh=True) == [[]] and scenes[-1].without == (), "one photo is not worth a training"
+    wrong[:] = ["v01", "v02", "v03"]
+    assert again(fresh=True) == [[]], "of so many it is not clear which are wrong"
 
 
 def test_a_demo_that_is_under_way_is_left_alone(tmp_path):

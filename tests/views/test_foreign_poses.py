@@ -221,6 +221,20 @@ def test_missing_photos_are_counted_and_left_out(tmp_path, write, capsys):
         parse(tmp_path)
 
 
+@pytest.mark.parametrize("write", [write_transforms, write_colmap])
+def test_photos_that_are_to_be_left_out_are_not_used_and_the_world_stays(tmp_path, write, capsys):
+    write(tmp_path)
+    full = parse(tmp_path, eval_interval=0)
+    outputs = parse(tmp_path, eval_interval=0, leave_out=("v04", "v01"))
+    assert names(outputs) == ["v00", "v02", "v03", "v05", "v06", "v07", "v08"]
+    assert outputs.cameras.camera_to_worlds.equal(full.cameras.camera_to_worlds[[0, 2, 3, 5, 6, 7, 8]])
+    assert "left out" not in capsys.readouterr().out
+    with pytest.raises(UserError, match="leave_out names v4, but no image of .* is called that"):
+        parse(tmp_path, leave_out=("v4",))
+    with pytest.raises(UserError, match="leave_out leaves 1 of the images of"):
+        parse(tmp_path, leave_out=tuple(ALL[1:]))
+
+
 def test_a_missing_photo_leaves_its_split(tmp_path):
     split = {"train_filenames": [f"images/v{i:02d}.png" for i in range(7)], "test_filenames": ["images/v07.png"]}
     write_transforms(tmp_path, **split)
