@@ -43,7 +43,7 @@ def read_poses(poses: Poses, root: Path, options: DataOptions) -> PosedViews:
     """Read the views of a scene in ``root``; raise ``UserError`` if they cannot be read or there are too few.
 
     Views whose photos are missing are left out with a note; it is an error if they are more than half, or with
-    ``strict``. Those that ``leave_out`` names are left out too; the world stays the same.
+    ``strict``.
     """
     source = read_source(poses, root)
     file = source.file
@@ -59,11 +59,8 @@ def read_poses(poses: Poses, root: Path, options: DataOptions) -> PosedViews:
         source.camera_to_world, options, file, source.orientation, source.applied, source.applied_scale
     )
     notes.append(far_note(placing, options.center_method == "none"))
-    left_out = _left_out(source.images, file, options.leave_out)
-    there = [index for index, image in enumerate(source.images) if image is not None and index not in left_out]
-    if len(there) < 2 and left_out:
-        raise UserError(f"leave_out leaves {len(there)} of the images of {file}: name fewer.")
-    images = [image.absolute() for index in there if (image := source.images[index]) is not None]
+    there = [index for index, image in enumerate(source.images) if image is not None]
+    images = [image.absolute() for image in source.images if image is not None]
     cameras = _cameras(file, [camera for index in there if (camera := source.cameras[index])], placed[there], images)
     members = source.members
     if members is not None:
@@ -76,17 +73,6 @@ def read_poses(poses: Poses, root: Path, options: DataOptions) -> PosedViews:
     return PosedViews(
         images, stems, cameras, members, placing, source.points, tuple(note for note in notes if note is not None)
     )
-
-
-def _left_out(images: Sequence[Path | None], file: Path, stems: Sequence[str]) -> set[int]:
-    """Return the indices of the images that ``leave_out`` names; raise ``UserError`` for a name of none."""
-    of_stem: dict[str, set[int]] = {}
-    for index, image in enumerate(images):
-        if image is not None:
-            of_stem.setdefault(image.stem, set()).add(index)
-    if unknown := [stem for stem in stems if stem not in of_stem]:
-        raise UserError(f"leave_out names {unknown[0]}, but no image of {file} is called that: correct it.")
-    return set().union(*(of_stem[stem] for stem in stems))
 
 
 def _cameras(file: Path, given: Sequence[FrameCamera], poses: Tensor, images: Sequence[Path]) -> SceneCameras:

@@ -170,7 +170,20 @@ class SceneData:
         resize_cameras(cameras, size[:, :1], size[:, 1:])
 
     def views_of_split(self, views: PosedViews, split: str) -> list[int]:
-        """Return the indices of the views of "train", "val" or "test"."""
+        """Return the indices of the views of "train", "val" or "test", without those that ``leave_out`` names."""
+        wanted, left_out = self._with_left_out(views, split), set()
+        for name in self.config.leave_out:
+            found = {index for index, stems in enumerate(views.stems) if name in stems}
+            if not found:
+                raise UserError(
+                    f"leave_out names {name}, but no image in {self._scene.root} is called that: correct it."
+                )
+            left_out |= found
+        if left_out >= set(wanted):
+            raise UserError(f"leave_out leaves no image for {split}: name fewer.")
+        return [index for index in wanted if index not in left_out]
+
+    def _with_left_out(self, views: PosedViews, split: str) -> list[int]:
         if split not in ("train", "val", "test"):
             raise ValueError(f"unknown split {split!r}")
         if views.members is not None:
