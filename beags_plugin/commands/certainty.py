@@ -48,8 +48,7 @@ def certainty(
     """Judge a finished demo.
 
     run: its run. scene: of its photos, with poses.json if poses were computed. again: the demo's command.
-    apart: the folder of the masks of separated things, with the report on their agreement. seen:
-    what the photos show.
+    apart: the folder of the masks of separated things, with the report on their agreement. seen: what the photos show.
     """
     lines, figures = [], {}
     prepared = read_object(run / "prepared/report.json")
@@ -127,9 +126,9 @@ def _of_masks(level: str, agreement: dict[str, Any], left_out: bool) -> str:
 
 def _without_poses(without: int, photos: int, names: list[str]) -> str:
     named = ", ".join(names[:NAMED]) + (" ..." if len(names) > NAMED else "")
-    verb = "has" if without == 1 else "have"
-    end = "was left out" if without == 1 else "were left out"
-    return f"{without} of {photos} photos {verb} no pose and {end}{f' ({named})' if named else ''}."
+    were = "was" if without == 1 else "were"
+    in_brackets = f" ({named})" if named else ""
+    return f"{without} of {photos} photos {verb(without, 'have')} no pose and {were} left out{in_brackets}."
 
 
 def _next(again: Again, agreement: dict[str, Any], scene: MadeScene) -> list[str]:

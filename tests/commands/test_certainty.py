@@ -185,7 +185,7 @@ def test_masks_that_a_network_made_are_made_to_agree_and_those_that_were_mended_
 
     assert not agrees()  # the user's own
     (data / MADE).write_text(json.dumps({"photos": "", "masks": folder_digest(data / "masks")}))
-    assert as_made(data) and agrees() and not agrees("objects")  # as earlier versions wrote it
+    assert as_made(data) and agrees() and not agrees("objects")  # Earlier versions wrote made.json like this.
     files = {path.name: content_digest([path]) for path in (data / "masks").glob("*.png")}
     (data / MADE).write_text(json.dumps({"photos": "", "masks": "of all", "files": files}))
     (data / "masks/v02.png").unlink()

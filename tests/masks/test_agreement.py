@@ -247,11 +247,11 @@ def test_damage_that_views_share_is_no_wrong_pose(scene):
 @pytest.mark.parametrize(
     ("given", "expected"),
     [
-        ((40, 50, 120, 90), False),  # as drawn
+        ((40, 50, 120, 90), False),  # the mask is as drawn
         ((40, 60, 120, 100), True),
         ((52, 44, 132, 84), True),
-        ((40, 50, 135, 90), False),  # with a plinth
-        ((40, 30, 120, 110), False),  # with a blanket
+        ((40, 50, 135, 90), False),  # the mask takes in a plinth
+        ((40, 30, 120, 110), False),  # the mask takes in a blanket
         ((80, 50, 120, 90), False),  # half of it is missing
         ((40, 110, 120, 150), False),  # another thing of the same size
         ((40, 65, 98, 105), False),  # another thing that is smaller

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -296,19 +295,18 @@ def test_prompts_and_the_weights_of_both_models_are_checked_before_masks_are_mad
     replace(source, detector=str(dino)).check()
 
 
-def test_without_a_network_the_sentence_comes_at_once(tmp_path, monkeypatch, caplog):
+def test_without_a_network_the_sentence_comes_without_tries(tmp_path, monkeypatch, caplog):
     """The hub's client would try for half a minute, and print a line for each try."""
     import huggingface_hub
     from huggingface_hub import constants
 
     monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
     huggingface_hub.close_session()
-    begin = time.monotonic()
     with pytest.raises(
         UserError, match=r"no connection to http://127\.0\.0\.1:9\): name a folder that holds them, or go"
     ):
         classes("nobody/nothing", TRACKERS, "video model")
-    assert time.monotonic() - begin < 8 and not caplog.records
+    assert not caplog.records, "each try would log a line"
 
 
 def test_weights_of_the_hub_are_asked_for_only_if_they_are_not_here(sam2, monkeypatch):
