@@ -25,7 +25,6 @@ ROOMS = [
     "objects",
     "pictures",
     "runs",
-    "options",
     "views",
     "evaluation",
     "refiners",
@@ -40,7 +39,7 @@ ROOMS = [
     "posing",
     "data",
     "labels sample",
-    "system",
+    "system options",
 ]
 ORDER = {room: place for place, rooms in enumerate(ROOMS) for room in rooms.split()}
 MODULES = {path.relative_to(PACKAGE).with_suffix("").as_posix(): path for path in PACKAGE.rglob("*.py")}
@@ -165,6 +164,38 @@ def test_the_check_sees_what_it_should():
     target = 'load("beags_plugin.plugin.model:BeagsModel")'
     assert lazy_targets("plugin/options/config", target) == set()
     assert upward({"core/sh": lazy_targets("core/sh", target)}), "only configs of nerfstudio may name what they set up"
+
+
+def behaviour(source: str) -> set[str]:
+    """The functions, methods but properties, and statements other than constants and classes in a source."""
+    top = ast.parse(source).body
+    statements = [*top, *(inner for node in top if isinstance(node, ast.ClassDef) for inner in node.body)]
+    data = (ast.Import, ast.ImportFrom, ast.ClassDef, ast.Assign, ast.AnnAssign, ast.Expr)
+    return {
+        getattr(node, "name", ast.unparse(node))
+        for node in statements
+        if not isinstance(node, data) and "property" not in map(ast.unparse, getattr(node, "decorator_list", ()))
+    }
+
+
+def test_options_are_data():
+    """Any room may import them: they hold dataclasses and constants, and load no torch."""
+    every = [module for module in MODULES if module.startswith("options/")]
+    assert len(every) > 2
+    for module in every:
+        source = MODULES[module].read_text()
+        assert not behaviour(source), f"beags_plugin/{module}.py does work"
+        others = {name for name in imported(source) if not name.startswith("beags_plugin.options.")}
+        packages = {name.split(".")[0] for name in others} - {"__future__"}
+        assert packages <= {*sys.stdlib_module_names, "tyro"}, f"beags_plugin/{module}.py imports {packages}"
+    loaded = loaded_by("; ".join(f"import beags_plugin.{module.replace('/', '.')}" for module in every))
+    assert not loaded & {"torch", "nerfstudio", "beags_plugin.system.errors"}
+
+
+def test_the_check_of_options_sees_what_it_should():
+    data = 'A = 1\n"""Text."""\n@dataclass\nclass B:\n    a: int = A\n    @property\n    def b(self): ...\n'
+    assert behaviour(data) == set()
+    assert behaviour(f"{data}    def c(self): ...\ndef d(): ...\nif A:\n    B = 1\n") == {"c", "d", "if A:\n    B = 1"}
 
 
 def test_every_file_lies_in_a_room():

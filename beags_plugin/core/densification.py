@@ -11,6 +11,7 @@ from torch import Tensor
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import SH_C0, num_sh_bases
 from beags_plugin.core.surfels import Surfels, opacities
+from beags_plugin.options.scene_options import DensifyConfig
 
 # These values are those of the official code of 2DGS (Huang et al., SIGGRAPH 2024); scales are relative to the extent.
 GRADIENT_THRESHOLD = 2e-4  # mean screen gradient from which a surfel is cloned or split
@@ -20,71 +21,49 @@ PRUNE_OPACITY = 0.05  # fainter surfels are pruned
 PRUNE_SCALE = 0.1  # larger surfels are pruned
 RESET_OPACITY = 0.01
 INITIAL_OPACITY = 0.1
-# Ours, for runs that are shorter than the official ones: ``DensifyConfig.scaled`` makes no interval shorter than these.
+# Ours, for runs that are shorter than the official ones: ``scaled`` makes no interval shorter than these.
 LEAST_EVERY = 50  # gradients must be averaged over many views
 LEAST_RESET_EVERY = 1_000  # opacities need time to recover
 COINCIDENT = 1e-7  # smallest initial scale relative to the cloud's size: coincident points have no neighbour distance
 
 
-@dataclass(frozen=True)
-class DensifyConfig:
-    """Options of densification; steps are stated for a base of schedule_steps."""
+def scaled(config: DensifyConfig, factor: float) -> DensifyConfig:
+    """Return the options for a run ``factor`` times as long; no interval falls below the least ones."""
 
-    every: int = 100
-    """Steps between two rounds of growth and pruning."""
-    start: int = 500
-    """Step after which growth and pruning begin."""
-    stop: int = 15_000
-    """Step before which growth and pruning end."""
-    prune_scale_after: int = 3_000
-    """Step after which Gaussians larger than a tenth of the scene's extent are pruned; 0 keeps them."""
-    reset_every: int = 3_000
-    """Steps between resets of all opacities to at most 0.01; 0 never."""
-    far_limits: bool = False
-    """Scale the size limits of splitting and pruning by the distance of the nearest camera where that exceeds the
-    scene's extent, for far backgrounds. False, the official rule, scales them by the extent alone."""
-    max_surfels: int = 0
-    """Largest number of Gaussians, which bounds time and memory; 0 sets no bound."""
-    pixels_per_surfel: float = 0.0
-    """Least number of training pixels per Gaussian, against overfitting to few images; 0, the official rule, sets no
-    bound."""
-    free_share: float = 0.0
-    """Gaussians that reach nearer to a camera than this share of the depth of its nearest seed points are removed,
-    because they cover held-out photos. 0 keeps them, and so does a scene whose seed points were generated."""
+    def steps(stated: int, least: int = 0) -> int:
+        return max(round(stated * factor), min(least, stated)) if stated > 0 else stated
 
-    def scaled(self, factor: float) -> DensifyConfig:
-        """Return these options for a run ``factor`` times as long; no interval falls below the least ones."""
+    return replace(
+        config,
+        every=max(steps(config.every, LEAST_EVERY), 1),
+        start=steps(config.start),
+        stop=steps(config.stop),
+        prune_scale_after=steps(config.prune_scale_after, 1),
+        reset_every=steps(config.reset_every, LEAST_RESET_EVERY),
+    )
 
-        def steps(stated: int, least: int = 0) -> int:
-            return max(round(stated * factor), min(least, stated)) if stated > 0 else stated
 
-        return replace(
-            self,
-            every=max(steps(self.every, LEAST_EVERY), 1),
-            start=steps(self.start),
-            stop=steps(self.stop),
-            prune_scale_after=steps(self.prune_scale_after, 1),
-            reset_every=steps(self.reset_every, LEAST_RESET_EVERY),
-        )
+def bounded(config: DensifyConfig, pixels: int) -> DensifyConfig:
+    """Return the options with ``max_surfels`` for this many training pixels."""
+    if not config.pixels_per_surfel > 0:
+        return config
+    by_pixels = max(int(pixels / config.pixels_per_surfel), 1)
+    return replace(config, max_surfels=min(by_pixels, config.max_surfels) if config.max_surfels > 0 else by_pixels)
 
-    def bounded(self, pixels: int) -> DensifyConfig:
-        """Return these options with ``max_surfels`` for this many training pixels."""
-        if not self.pixels_per_surfel > 0:
-            return self
-        by_pixels = max(int(pixels / self.pixels_per_surfel), 1)
-        return replace(self, max_surfels=min(by_pixels, self.max_surfels) if self.max_surfels > 0 else by_pixels)
 
-    def grows_at(self, done: int) -> bool:
-        """Return whether the scene is densified after ``done`` steps."""
-        return self.start < done < self.stop and done % self.every == 0
+def grows_at(config: DensifyConfig, done: int) -> bool:
+    """Return whether the scene is densified after ``done`` steps."""
+    return config.start < done < config.stop and done % config.every == 0
 
-    def frees_at(self, done: int, base_steps: int) -> bool:
-        """Return whether the space before cameras is freed after ``done`` steps of a base of ``base_steps``."""
-        return self.free_share > 0.0 and self.start < done < base_steps and done % self.every == 0
 
-    def resets_at(self, done: int) -> bool:
-        """Return whether opacities are reset after ``done`` steps."""
-        return self.reset_every > 0 and done < self.stop and done % self.reset_every == 0
+def frees_at(config: DensifyConfig, done: int, base_steps: int) -> bool:
+    """Return whether the space before cameras is freed after ``done`` steps of a base of ``base_steps``."""
+    return config.free_share > 0.0 and config.start < done < base_steps and done % config.every == 0
+
+
+def resets_at(config: DensifyConfig, done: int) -> bool:
+    """Return whether opacities are reset after ``done`` steps."""
+    return config.reset_every > 0 and done < config.stop and done % config.reset_every == 0
 
 
 @dataclass(frozen=True)

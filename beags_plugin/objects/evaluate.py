@@ -15,8 +15,8 @@ from beags_plugin.evaluation.records import SceneMetrics
 from beags_plugin.evaluation.report import RunMetrics, Stage
 from beags_plugin.evaluation.run_metrics import evaluate_scene
 from beags_plugin.evaluation.shown import shown_pixels
-from beags_plugin.options.scene_options import fixed_background
 from beags_plugin.pictures.worst_views import WorstMask, draw_worst
+from beags_plugin.rasterizers.rendering import fixed_background
 from beags_plugin.runs.layout import BASE_SNAPSHOT, EXTRACTION_FILE
 from beags_plugin.runs.read import SavedScene, read_run
 from beags_plugin.runs.run import Run

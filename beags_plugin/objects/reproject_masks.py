@@ -19,7 +19,7 @@ from beags_plugin.labels.classes import write_mask
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.pictures.masks import Changed, before_and_after
 from beags_plugin.preparation.consistent_masks import chosen_reprojection, render_depths, reprojected_masks
-from beags_plugin.preparation.pipeline import known_classes
+from beags_plugin.preparation.pipeline import check_options, known_classes
 from beags_plugin.runs.relocation import check_data
 from beags_plugin.runs.run import Run
 from beags_plugin.system.errors import UserError, writing
@@ -90,7 +90,7 @@ def reproject_run(run: Run, options: ReprojectionOptions) -> ReprojectedRun:
     config = replace(config, reprojection=options.method or config.reprojection)
     if config.reprojection == "none":
         config = replace(config, reprojection="voxel")
-    config.check()
+    check_options(config)
     start = time.perf_counter()
     views = manager.views("train")
     with progress_bar("Reading masks", passing=True) as progress:

@@ -1,1 +1,1 @@
-"""Options of the scene and of its training, and their checks, without nerfstudio."""
+"""Options of the scene and of its training: dataclasses and constants, without torch."""

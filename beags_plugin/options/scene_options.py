@@ -2,22 +2,62 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import torch
-from torch import Tensor
 from tyro.conf import Suppress
 
-from beags_plugin.core.densification import DensifyConfig
-from beags_plugin.core.sh import MAX_DEGREE
 from beags_plugin.options.loss_spec import LossSpec
-from beags_plugin.options.schedule import PhaseSchedule
-from beags_plugin.preparation.pipeline import PreparationConfig
-from beags_plugin.refiners import make_refiner
-from beags_plugin.system.errors import UserError
+
+
+@dataclass(frozen=True)
+class DensifyConfig:
+    """Options of densification; steps are stated for a base of schedule_steps."""
+
+    every: int = 100
+    """Steps between two rounds of growth and pruning."""
+    start: int = 500
+    """Step after which growth and pruning begin."""
+    stop: int = 15_000
+    """Step before which growth and pruning end."""
+    prune_scale_after: int = 3_000
+    """Step after which Gaussians larger than a tenth of the scene's extent are pruned; 0 keeps them."""
+    reset_every: int = 3_000
+    """Steps between resets of all opacities to at most 0.01; 0 never."""
+    far_limits: bool = False
+    """Scale the size limits of splitting and pruning by the distance of the nearest camera where that exceeds the
+    scene's extent, for far backgrounds. False, the official rule, scales them by the extent alone."""
+    max_surfels: int = 0
+    """Largest number of Gaussians, which bounds time and memory; 0 sets no bound."""
+    pixels_per_surfel: float = 0.0
+    """Least number of training pixels per Gaussian, against overfitting to few images; 0, the official rule, sets no
+    bound."""
+    free_share: float = 0.0
+    """Gaussians that reach nearer to a camera than this share of the depth of its nearest seed points are removed,
+    because they cover held-out photos. 0 keeps them, and so does a scene whose seed points were generated."""
+
+
+@dataclass(frozen=True)
+class PreparationConfig:
+    """Options of the stages between base training and refinement."""
+
+    reprojection: str = "auto"
+    """How the views' masks are made to agree: pairwise (exact), voxel (quick), auto (the one that fits the number of
+    views), none (the masks stay as they are), or a registered one."""
+    tau: float = 0.02
+    """Tolerance of pairwise: a vote counts if its point is visible, |z - depth| <= tau z; inf counts every vote
+    (E5)."""
+    depth: str = "median"
+    """Which depth is lifted: median or expected."""
+    agree: bool = False
+    """Weigh the views' masks by how far each agrees with the others, and redraw them where one decision per Gaussian
+    contradicts them: for masks that a network made, because many views share its errors."""
+    k: int = 2000
+    """Neighbours that set the voxel size (E8); more make larger voxels."""
+    k_pixels: int = 0
+    """Training pixels for which k is stated; with fewer, k shrinks in proportion, so that voxels keep their size. 0, as
+    in the paper, takes k as it is."""
 
 
 @dataclass
@@ -74,30 +114,3 @@ class SceneOptions:
     """Near plane in units of the scene's extent."""
     far: Suppress[float] = 100.0
     """Far plane in units of the scene's extent."""
-
-    def check(self) -> None:
-        """Raise ``UserError`` for a value with which training cannot work."""
-        for name in ("base_steps", "refine_steps", "schedule_steps"):
-            if (steps := getattr(self, name)) < 0:
-                raise UserError(f"{name} is {steps}: give a number of steps, 0 or more.")
-        if not 0 <= self.sh_degree <= MAX_DEGREE:
-            raise UserError(f"sh_degree is {self.sh_degree}: choose 0 to {MAX_DEGREE}.")
-        for name, value in (("sh_degree_interval", self.sh_degree_interval), ("densify.every", self.densify.every)):
-            if value < 1:
-                raise UserError(f"{name} is {value}: give a number of steps, 1 or more.")
-        if not 0 < self.near < self.far < math.inf:
-            raise UserError(f"near is {self.near} and far {self.far}: near must lie above 0 and below far.")
-        if not all(0 < rate < math.inf for rate in self.position_lr):
-            raise UserError(f"position_lr is {self.position_lr}: give two learning rates above 0.")
-        if not 0 < self.base_lr_factor < math.inf:
-            raise UserError(f"base_lr_factor is {self.base_lr_factor}: give a factor above 0.")
-        make_refiner(self.refiner, self.refiner_options)
-
-    def schedule(self) -> PhaseSchedule:
-        """Return the steps of both phases."""
-        return PhaseSchedule(self.base_steps, self.refine_steps, self.schedule_steps, self.start_from is not None)
-
-
-def fixed_background(config: SceneOptions, device: torch.device | str = "cpu") -> Tensor:
-    """Return the colour [3] behind a scene outside training: the one of its training, black for "random"."""
-    return torch.full((3,), 1.0 if config.background_color == "white" else 0.0, device=device)

@@ -19,13 +19,12 @@ from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.class_members import ClassMembers
 from beags_plugin.losses.photometric import psnr, ssim
-from beags_plugin.options.scene_options import fixed_background
 from beags_plugin.plugin.training.callbacks import training_callbacks
 from beags_plugin.plugin.training.scene_model import LastRender, SceneModel
 from beags_plugin.plugin.viewer.panel import ObjectPanel, ViewerLink
 from beags_plugin.plugin.viewer.viewing import Viewing, called_by_viewer, scene_outputs
 from beags_plugin.rasterizers.interface import RasterOutputs, SurfelInputs
-from beags_plugin.rasterizers.rendering import surfel_inputs
+from beags_plugin.rasterizers.rendering import fixed_background, surfel_inputs
 from beags_plugin.system.devices import to_device_async
 from beags_plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.views.objects_alone import of_objects, where_known

@@ -14,10 +14,10 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import profiler, writer
 from nerfstudio.utils.decorators import check_main_thread
 
+from beags_plugin.core.schedule import PhaseSchedule
 from beags_plugin.importers.base import find_importer
 from beags_plugin.objects.clean import decide
 from beags_plugin.options.run_format import CONFIG_FILE
-from beags_plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.options.machine import check_machine
 from beags_plugin.plugin.options.rollback import Rollback, noted

@@ -15,6 +15,7 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks import REPROJECTIONS
+from beags_plugin.options.scene_options import PreparationConfig
 from beags_plugin.preparation.refiner import Progress
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
@@ -76,13 +77,12 @@ def reprojected_masks(
     cameras: Sequence[Camera],
     masks: LabelMaps,
     known: ClassRanks,
-    config,
+    config: PreparationConfig,
     progress: Progress | None = None,
 ) -> ConsistentMasks:
     """Return the labels of all views, voted by the views with masks; one voted view is in memory at a time.
 
-    depths: per view [H, W], depth of the surface, perhaps on disk. config: a ``PreparationConfig`` with a registered
-    reprojection.
+    depths: per view [H, W], depth of the surface, perhaps on disk. config: names a registered reprojection.
     """
     given = translated(masks, known, known.ranks)
     ranked, confidence = LabelMaps(), CompressedMaps()

@@ -13,7 +13,6 @@ from torch import Tensor
 from beags_plugin.assignment.assignment import Assignment, by_largest
 from beags_plugin.assignment.contributions import check_class_ids, contributions
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.lifting import TAU
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE, objects_in
@@ -21,6 +20,7 @@ from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.occupancy.grid import VisibilityGrid
+from beags_plugin.options.scene_options import PreparationConfig
 from beags_plugin.preparation.agreed import AgreementReport, agree
 from beags_plugin.preparation.consistent_masks import (
     AUTO,
@@ -42,46 +42,26 @@ from beags_plugin.system.progress import timed
 LEAST_K = 10  # Fewer neighbours would measure the noise of the depth rather than the distance of points.
 
 
-@dataclass(frozen=True)
-class PreparationConfig:
-    """Options of the stages between base training and refinement."""
+def check_options(config: PreparationConfig) -> None:
+    """Raise ``UserError`` for a value that a stage would refuse, hours before that stage."""
+    REPROJECTIONS.check(config.reprojection, AUTO, "none")
+    if config.reprojection not in (AUTO, "none"):
+        REPROJECTIONS.get(config.reprojection)  # Another package's may fail to load.
+    check_choice(config.depth, SURFACE_DEPTHS, "surface depth")
+    if not config.tau >= 0:
+        raise UserError(f"tau is {config.tau}: it must be 0 or more (inf counts every vote).")
+    if not config.k >= 1:
+        raise UserError(f"k is {config.k}: the voxel size needs at least 1 neighbour.")
+    if not config.k_pixels >= 0:
+        raise UserError(f"k_pixels is {config.k_pixels}: it must be a number of pixels, or 0 to take k as it is.")
 
-    reprojection: str = AUTO
-    """How the views' masks are made to agree: pairwise (exact), voxel (quick), auto (the one that fits the number of
-    views), none (the masks stay as they are), or a registered one."""
-    tau: float = TAU
-    """Tolerance of pairwise: a vote counts if its point is visible, |z - depth| <= tau z; inf counts every vote
-    (E5)."""
-    depth: str = "median"
-    """Which depth is lifted: median or expected."""
-    agree: bool = False
-    """Weigh the views' masks by how far each agrees with the others, and redraw them where one decision per Gaussian
-    contradicts them: for masks that a network made, because many views share its errors."""
-    k: int = 2000
-    """Neighbours that set the voxel size (E8); more make larger voxels."""
-    k_pixels: int = 0
-    """Training pixels for which k is stated; with fewer, k shrinks in proportion, so that voxels keep their size. 0, as
-    in the paper, takes k as it is."""
 
-    def check(self) -> None:
-        """Raise ``UserError`` for a value that a stage would refuse, hours before that stage."""
-        REPROJECTIONS.check(self.reprojection, AUTO, "none")
-        if self.reprojection not in (AUTO, "none"):
-            REPROJECTIONS.get(self.reprojection)  # Another package's may fail to load.
-        check_choice(self.depth, SURFACE_DEPTHS, "surface depth")
-        if not self.tau >= 0:
-            raise UserError(f"tau is {self.tau}: it must be 0 or more (inf counts every vote).")
-        if not self.k >= 1:
-            raise UserError(f"k is {self.k}: the voxel size needs at least 1 neighbour.")
-        if not self.k_pixels >= 0:
-            raise UserError(f"k_pixels is {self.k_pixels}: it must be a number of pixels, or 0 to take k as it is.")
-
-    def neighbours(self, cameras: Sequence[Camera]) -> int:
-        """Return k for these training views, at least ``LEAST_K`` if it shrinks."""
-        pixels = sum(camera.height * camera.width for camera in cameras)
-        if self.k_pixels == 0 or pixels >= self.k_pixels:
-            return self.k
-        return min(self.k, max(round(self.k * pixels / self.k_pixels), LEAST_K))
+def neighbours(config: PreparationConfig, cameras: Sequence[Camera]) -> int:
+    """Return k for these training views, at least ``LEAST_K`` if it shrinks."""
+    pixels = sum(camera.height * camera.width for camera in cameras)
+    if config.k_pixels == 0 or pixels >= config.k_pixels:
+        return config.k
+    return min(config.k, max(round(config.k * pixels / config.k_pixels), LEAST_K))
 
 
 @dataclass(frozen=True)
@@ -173,7 +153,7 @@ def prepare(
         config.depth,
         stage,
     )
-    k = config.neighbours(cameras)
+    k = neighbours(config, cameras)
 
     start = time.perf_counter()
     with stage("Building voxel grids") as progress:

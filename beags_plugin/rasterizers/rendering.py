@@ -11,11 +11,17 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ranks import ClassRanks
+from beags_plugin.options.scene_options import SceneOptions
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs, map_ids
 from beags_plugin.system.errors import check_choice
 
 SURFACE_DEPTHS = ("median", "expected")
 """The depths of E4 that can stand for the surface where pixels are lifted into space."""
+
+
+def fixed_background(config: SceneOptions, device: torch.device | str = "cpu") -> Tensor:
+    """Return the colour [3] behind a scene outside training: the one of its training, black for "random"."""
+    return torch.full((3,), 1.0 if config.background_color == "white" else 0.0, device=device)
 
 
 def surfel_inputs(

@@ -22,8 +22,8 @@ from typing import Any, TypeVar
 import yaml
 
 from beags_plugin.options.loss_spec import LossSpec
-from beags_plugin.options.run_format import RUN_FORMAT, other_format
-from beags_plugin.options.scene_options import SceneOptions
+from beags_plugin.options.run_format import RUN_FORMAT
+from beags_plugin.options.scene_options import DensifyConfig, PreparationConfig, SceneOptions
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import reason
 from beags_plugin.views.data_options import DataOptions, RunViewOptions
@@ -31,7 +31,12 @@ from beags_plugin.views.data_options import DataOptions, RunViewOptions
 Config = TypeVar("Config")
 _PATHS = (pathlib.PurePath, pathlib.PosixPath, pathlib.WindowsPath, pathlib.Path, pathlib.PurePosixPath)
 _FUNCTIONS = {"nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate"}  # Nerfstudio's configs name no other.
-MOVED = {"beags_plugin.plugin.options.loss_spec.LossSpec": LossSpec}  # Older runs name these classes so.
+MOVED = {
+    "beags_plugin.plugin.options.loss_spec.LossSpec": LossSpec,
+    "beags_plugin.core.densification.DensifyConfig": DensifyConfig,
+    "beags_plugin.preparation.pipeline.PreparationConfig": PreparationConfig,
+}
+"""Names of these classes in the config.yml of older runs."""
 _GONE = ("beags_plugin.plugin.options.pyramid.PyramidConfig",)  # Options that older runs have.
 BEGINNINGS = ("load_dir", "load_checkpoint", "load_config", "load_step")  # They say what a run was started from.
 _GROUPS = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
@@ -212,6 +217,12 @@ def _only_named(loader: FinishedRunLoader, suffix: str, node: yaml.Node) -> str:
 
 
 FinishedRunLoader.add_multi_constructor("tag:yaml.org,2002:python/name:", _only_named)
+
+
+def other_format(run: object, version: object = None) -> UserError:
+    """Return the error for a run of another version than ours. run: its config.yml. version: the one in it, if any."""
+    age = "a newer" if isinstance(version, int) and version > RUN_FORMAT else "an older"
+    return UserError(f"{run} was written by {age} version of beags: train again, or use the version that wrote it.")
 
 
 def read_run_config(path: Path) -> RunConfig:

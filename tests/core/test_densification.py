@@ -12,9 +12,10 @@ import torch
 from beags_plugin.core.densification import (
     GRADIENT_THRESHOLD,
     RESET_OPACITY,
-    DensifyConfig,
     GradientStatistics,
+    bounded,
     densify,
+    frees_at,
     initial_surfels,
     length_units,
     reset_opacity,
@@ -23,6 +24,7 @@ from beags_plugin.core.densification import (
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.options.scene_options import DensifyConfig
 
 EXTENT = 2.0
 CONFIG = DensifyConfig()
@@ -198,15 +200,15 @@ def test_coincident_and_few_points_give_finite_surfels():
 
 
 def test_the_bound_by_pixels():
-    assert CONFIG.bounded(1000) == CONFIG
+    assert bounded(CONFIG, 1000) == CONFIG
     config = replace(CONFIG, pixels_per_surfel=50.0)
-    assert config.bounded(1000).max_surfels == 20 and config.bounded(10).max_surfels == 1
-    assert replace(config, max_surfels=7).bounded(1000).max_surfels == 7
-    assert replace(config, max_surfels=90).bounded(1000).max_surfels == 20
+    assert bounded(config, 1000).max_surfels == 20 and bounded(config, 10).max_surfels == 1
+    assert bounded(replace(config, max_surfels=7), 1000).max_surfels == 7
+    assert bounded(replace(config, max_surfels=90), 1000).max_surfels == 20
 
 
 def test_the_space_before_cameras_is_freed_in_each_round_to_the_end_of_the_base():
     config = replace(CONFIG, free_share=0.5)
-    steps = [done for done in range(1, 40_000) if config.frees_at(done, 30_000)]
+    steps = [done for done in range(1, 40_000) if frees_at(config, done, 30_000)]
     assert steps == list(range(600, 30_000, 100))
-    assert not any(CONFIG.frees_at(done, 30_000) for done in steps)
+    assert not any(frees_at(CONFIG, done, 30_000) for done in steps)

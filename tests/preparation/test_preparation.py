@@ -14,10 +14,11 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import LabelMaps
+from beags_plugin.options.scene_options import PreparationConfig
 from beags_plugin.preparation import consistent_masks
 from beags_plugin.preparation.agreed import AgreementReport
 from beags_plugin.preparation.consistent_masks import chosen_reprojection
-from beags_plugin.preparation.pipeline import PreparationConfig, prepare
+from beags_plugin.preparation.pipeline import check_options, neighbours, prepare
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.refiners.none import NoRefiner
@@ -133,10 +134,10 @@ def test_auto_gives_what_the_method_that_it_chose_gives(monkeypatch):
 
 def test_k_follows_the_training_pixels_where_it_is_stated_for_more():
     cameras = [SimpleNamespace(height=100, width=200)] * 5  # 1e5 pixels
-    assert PreparationConfig(k=2000).neighbours(cameras) == 2000
-    assert PreparationConfig(k=2000, k_pixels=400_000).neighbours(cameras) == 500
-    assert PreparationConfig(k=2000, k_pixels=50_000).neighbours(cameras) == 2000
-    assert PreparationConfig(k=2000, k_pixels=10**9).neighbours(cameras) == 10
-    assert PreparationConfig(k=4, k_pixels=10**9).neighbours(cameras) == 4
+    assert neighbours(PreparationConfig(k=2000), cameras) == 2000
+    assert neighbours(PreparationConfig(k=2000, k_pixels=400_000), cameras) == 500
+    assert neighbours(PreparationConfig(k=2000, k_pixels=50_000), cameras) == 2000
+    assert neighbours(PreparationConfig(k=2000, k_pixels=10**9), cameras) == 10
+    assert neighbours(PreparationConfig(k=4, k_pixels=10**9), cameras) == 4
     with pytest.raises(UserError, match="k_pixels is -1"):
-        PreparationConfig(k_pixels=-1).check()
+        check_options(PreparationConfig(k_pixels=-1))

@@ -15,8 +15,9 @@ from raster_scenes import CLASSES
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.masks.voxel_reprojection import reproject_voxel
+from beags_plugin.options.scene_options import PreparationConfig
 from beags_plugin.preparation import consistent_masks
-from beags_plugin.preparation.pipeline import PreparationConfig, prepare
+from beags_plugin.preparation.pipeline import prepare
 from beags_plugin.refiners import make_refiner
 from beags_plugin.system import filed_tensors
 from beags_plugin.system.errors import UserError

@@ -89,13 +89,21 @@ def test_configs_of_runs_are_read_as_nerfstudio_reads_them(config):
     assert yaml.dump(load_run_config(config)) == yaml.dump(yaml.load(text, Loader=yaml.Loader))
 
 
-def test_classes_that_have_moved_since_are_found_under_their_former_names(config, tmp_path):
+@pytest.mark.parametrize(
+    ("now", "former"),
+    [
+        ("options.loss_spec.LossSpec", "plugin.options.loss_spec.LossSpec"),
+        ("options.scene_options.DensifyConfig", "core.densification.DensifyConfig"),
+        ("options.scene_options.PreparationConfig", "preparation.pipeline.PreparationConfig"),
+    ],
+)
+def test_classes_that_have_moved_since_are_found_under_their_former_names(config, tmp_path, now, former):
     import yaml
 
-    own = "!!python/object:beags_plugin.options.loss_spec.LossSpec"
+    own = f"!!python/object:beags_plugin.{now}\n"
     text = config.read_text("utf8")
     assert own in text
-    (tmp_path / "config.yml").write_text(text.replace(own, own.replace(".options.", ".plugin.options.")), "utf8")
+    (tmp_path / "config.yml").write_text(text.replace(own, f"!!python/object:beags_plugin.{former}\n"), "utf8")
     for read in (load_run_config, lambda path: yaml.load(path.read_text("utf8"), Loader=yaml.Loader)):
         assert yaml.dump(read(tmp_path / "config.yml")) == yaml.dump(load_run_config(config))
 

@@ -18,14 +18,14 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from tyro.conf import Suppress
 
 from beags_plugin.options.loss_spec import LossSpec
-from beags_plugin.options.run_format import CONFIG_FILE, RUN_FORMAT, other_format
+from beags_plugin.options.run_format import CONFIG_FILE, RUN_FORMAT
 from beags_plugin.plugin.options import rollback
 from beags_plugin.plugin.options.machine import check_machine, default_device
 from beags_plugin.plugin.options.model_options import BeagsModelConfig
 from beags_plugin.plugin.options.relocated import place_for_nerfstudio
 from beags_plugin.plugin.views.datamanager import BeagsDataManagerConfig
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
-from beags_plugin.runs.run_config import BEGINNINGS, MOVED
+from beags_plugin.runs.run_config import BEGINNINGS, MOVED, other_format
 from beags_plugin.system.errors import UserError, print_user_errors_plainly, writing
 from beags_plugin.system.interrupts import stop
 from beags_plugin.system.lock import lock_ahead

@@ -8,7 +8,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from torch.optim import Adam
 
 from beags_plugin.core.cameras import camera_extent
-from beags_plugin.options.schedule import log_linear
+from beags_plugin.core.schedule import log_linear
 from beags_plugin.plugin.training.densifier import Densifier
 from beags_plugin.plugin.training.exposure import exposures_of_run
 from beags_plugin.plugin.training.monitor import Curves

@@ -9,7 +9,18 @@ from torch import Tensor
 from torch.optim import Adam
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.densification import Densified, GradientStatistics, densify, length_units, reset_opacity
+from beags_plugin.core.densification import (
+    Densified,
+    GradientStatistics,
+    bounded,
+    densify,
+    frees_at,
+    grows_at,
+    length_units,
+    reset_opacity,
+    resets_at,
+    scaled,
+)
 from beags_plugin.core.free_space import nearest_depths, reaches_before_camera
 from beags_plugin.plugin.training.near_growth import MaskedPhotos, on_objects, shared_pixels
 from beags_plugin.plugin.training.scene_edits import edit_scene, move_adam_state
@@ -29,9 +40,9 @@ class Densifier:
         cameras = datamanager.train_dataset.cameras
         self.camera_centers = cameras.camera_to_worlds[:, :3, 3]  # [V, 3] world
         pixels = int((cameras.height * cameras.width).sum())  # Pixels of all whole training images.
-        stated, close_ups = model.config.densify.scaled(model.schedule.scale), datamanager.close_ups
+        stated, close_ups = scaled(model.config.densify, model.schedule.scale), datamanager.close_ups
         of_objects, elsewhere = (0, pixels) if close_ups is None else shared_pixels(pixels, close_ups.object_pixels())
-        self.config, self.most_near = stated.bounded(elsewhere), stated.bounded(of_objects).max_surfels
+        self.config, self.most_near = bounded(stated, elsewhere), bounded(stated, of_objects).max_surfels
         self.photos: MaskedPhotos | None = None
         if close_ups is not None:
             with_objects = sorted({each.photo for each in close_ups.close_ups})
@@ -64,11 +75,11 @@ class Densifier:
         growing = self.model.growing and self.model.last_render is not None
         if growing:
             self._gather()
-            if config.grows_at(done):
+            if grows_at(config, done):
                 self._densify(done)
-        if not schedule.warm and config.frees_at(done, schedule.base_steps):
+        if not schedule.warm and frees_at(config, done, schedule.base_steps):
             self._free_cameras()
-        if growing and config.resets_at(done):
+        if growing and resets_at(config, done):
             self._reset_opacity()
 
     def _gather(self) -> None:

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.exposure import Exposures, Gains, gains, sightings
+from beags_plugin.core.schedule import log_linear
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.losses.reduction import ordered_linear
-from beags_plugin.options.schedule import log_linear
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.plugin.views.dataparser import BeagsDataParser

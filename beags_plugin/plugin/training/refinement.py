@@ -21,7 +21,7 @@ from beags_plugin.plugin.training.resumable import TrainingRun
 from beags_plugin.plugin.training.scene_edits import apply_edit
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
-from beags_plugin.preparation.pipeline import check_masks, prepare
+from beags_plugin.preparation.pipeline import check_masks, check_options, prepare
 from beags_plugin.preparation.refiner_training import Edit, OwnTraining, TrainedScene
 from beags_plugin.refiners import make_refiner
 from beags_plugin.runs.layout import BASE_SNAPSHOT, PREPARED
@@ -70,7 +70,7 @@ class RefinementSwitch:
         if self.refiner.joins_base and config.base_steps == 0:
             raise UserError("the refiner's option joint trains a base of its own: set base_steps, and load no base.")
         if config.refine_steps > 0:
-            config.prepare.check()
+            check_options(config.prepare)
         if config.refine_steps > 0 or self.refiner.joins_base:
             check_masks(view.labels for view in self.datamanager.views("train", original=True))
 

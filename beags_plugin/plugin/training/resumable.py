@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from beags_plugin.options.schedule import PhaseSchedule
+from beags_plugin.core.schedule import PhaseSchedule
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.training.optimizers import SceneOptimizer
 from beags_plugin.plugin.training.timing import StageSeconds

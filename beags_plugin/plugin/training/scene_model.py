@@ -15,14 +15,15 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.exposure import Exposures
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
+from beags_plugin.losses import make_loss
 from beags_plugin.losses.base import Loss
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.options.scene_options import fixed_background
 from beags_plugin.plugin.options.model_options import BeagsModelConfig
 from beags_plugin.plugin.training.timing import StepClock
 from beags_plugin.preparation.refiner_training import OwnTraining
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs
+from beags_plugin.rasterizers.rendering import fixed_background
 from beags_plugin.runs.checkpoint_file import exposures_of, extra_state
 from beags_plugin.splat_io.ply import thin_log_scales
 
@@ -81,7 +82,7 @@ class SceneModel(SplatfactoModel):
         self.photo_colors: Callable[[Tensor, int], Tensor] | None = None
         self.schedule = self.config.schedule()
         self.losses: dict[str, Loss] = {
-            name: spec.build(name, self.schedule)
+            name: make_loss(name, spec, self.schedule)
             for name, spec in self.config.losses.items()
             if spec.weight != 0.0 and (spec.phase != "refine" or self.schedule.refine_steps > 0)
         }

@@ -10,20 +10,21 @@ import pytest
 from beags_plugin.losses.occupancy import OccupancyLoss
 from beags_plugin.losses.photometric import PhotometricLoss
 from beags_plugin.masks import REPROJECTIONS
-from beags_plugin.preparation.pipeline import PreparationConfig
+from beags_plugin.options.scene_options import PreparationConfig
+from beags_plugin.preparation.pipeline import check_options
 from beags_plugin.system.errors import UserError
 
 
 @pytest.mark.parametrize("reprojection", ["auto", "none", "pairwise", "voxel"])
 @pytest.mark.parametrize("tau", [0.0, math.inf])
 def test_options_at_their_limits_are_taken(reprojection, tau):
-    PreparationConfig(reprojection=reprojection, tau=tau, depth="expected", k=1).check()  # raises nothing
+    check_options(PreparationConfig(reprojection=reprojection, tau=tau, depth="expected", k=1))  # raises nothing
 
 
 def test_a_reprojection_of_another_package_that_does_not_load(monkeypatch):
     monkeypatch.setitem(REPROJECTIONS._specs, "theirs", "no_such_package:reproject")
     with pytest.raises(UserError, match="'theirs' .*cannot be loaded"):
-        PreparationConfig(reprojection="theirs").check()
+        check_options(PreparationConfig(reprojection="theirs"))
 
 
 @pytest.mark.parametrize(

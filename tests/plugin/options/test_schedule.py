@@ -9,9 +9,11 @@ import torch
 
 pytest.importorskip("nerfstudio")
 
-from beags_plugin.core.densification import DensifyConfig
+from beags_plugin.core.densification import grows_at, resets_at, scaled
+from beags_plugin.core.schedule import PhaseSchedule, log_linear
+from beags_plugin.losses import make_loss
 from beags_plugin.options.loss_spec import LossSpec
-from beags_plugin.options.schedule import PhaseSchedule, log_linear
+from beags_plugin.options.scene_options import DensifyConfig
 from beags_plugin.plugin.training.callbacks import camera_extent
 from beags_plugin.plugin.training.scene_edits import move_adam_state
 
@@ -74,22 +76,22 @@ def model():
     return base_config().model_config.setup(scene_box=box, num_train_data=1, seed_points=points)
 
 
-def steps_where(happens):
-    return [done for done in range(1, 30_001) if happens(done)]
+def steps_where(happens, config):
+    return [done for done in range(1, 30_001) if happens(config, done)]
 
 
 def test_the_official_steps_of_growth_and_resets():
     config = DensifyConfig()
-    assert config.scaled(1.0) == config
-    assert steps_where(config.grows_at) == list(range(600, 15_000, 100))
-    assert steps_where(config.resets_at) == [3_000, 6_000, 9_000, 12_000]
-    assert not steps_where(replace(config, reset_every=0).resets_at)
+    assert scaled(config, 1.0) == config
+    assert steps_where(grows_at, config) == list(range(600, 15_000, 100))
+    assert steps_where(resets_at, config) == [3_000, 6_000, 9_000, 12_000]
+    assert not steps_where(resets_at, replace(config, reset_every=0))
 
 
 def test_a_shorter_run_has_the_same_proportions_but_no_shorter_intervals_than_it_can_bear():
-    half = DensifyConfig().scaled(0.5)
+    half = scaled(DensifyConfig(), 0.5)
     assert (half.every, half.start, half.stop, half.reset_every, half.prune_scale_after) == (50, 250, 7500, 1500, 1500)
-    short = DensifyConfig().scaled(0.1)
+    short = scaled(DensifyConfig(), 0.1)
     assert (short.every, short.start, short.stop, short.reset_every, short.prune_scale_after) == (
         50,
         50,
@@ -97,10 +99,10 @@ def test_a_shorter_run_has_the_same_proportions_but_no_shorter_intervals_than_it
         1000,
         300,
     )
-    never = DensifyConfig(reset_every=0, prune_scale_after=0, every=30).scaled(0.1)
+    never = scaled(DensifyConfig(reset_every=0, prune_scale_after=0, every=30), 0.1)
     # Steps stated shorter than the bound stay as stated.
     assert (never.reset_every, never.prune_scale_after, never.every) == (0, 0, 30)
-    assert DensifyConfig(prune_scale_after=3).scaled(0.1).prune_scale_after == 1  # 0 would be never
+    assert scaled(DensifyConfig(prune_scale_after=3), 0.1).prune_scale_after == 1  # 0 would be never
 
 
 def test_stated_steps_are_scaled_with_the_length_of_the_base():
@@ -110,8 +112,8 @@ def test_stated_steps_are_scaled_with_the_length_of_the_base():
     assert PhaseSchedule(0, 3_000, 30_000).scaled(7_000) == 7_000  # no base to scale by
     assert PhaseSchedule(30, 0, 30_000).scaled(100) == 1 and PhaseSchedule(30, 0, 30_000).scaled(0) == 0
     short = PhaseSchedule(3_000, 300, 30_000)
-    assert LossSpec(start=7_000).build("normal", short).start == 700
-    assert LossSpec(start=50, phase="refine").build("boundary", short).start == 3_050
+    assert make_loss("normal", LossSpec(start=7_000), short).start == 700
+    assert make_loss("boundary", LossSpec(start=50, phase="refine"), short).start == 3_050
 
 
 def test_the_sh_degree_grows_by_one_every_thousand_steps(model):

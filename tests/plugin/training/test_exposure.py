@@ -31,11 +31,11 @@ from beags_benchmarks.samples.config import VariedSample
 from beags_benchmarks.samples.exposure import photo_gains as true_gains
 from beags_plugin.core.color_fit import apply_affine
 from beags_plugin.core.exposure import Exposures
+from beags_plugin.core.schedule import PhaseSchedule
 from beags_plugin.objects.evaluate import evaluate_run
 from beags_plugin.objects.extract import extract_objects
 from beags_plugin.objects.photos import _image, photos_of
 from beags_plugin.objects.shown import shown_scene
-from beags_plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.presets import preset_config
 from beags_plugin.plugin.training.exposure import GAMMA, RATES, PhotoExposures, exposures_of_run, photo_gains
 from beags_plugin.plugin.views.datamanager import BeagsDataManager, BeagsDataManagerConfig

@@ -11,9 +11,9 @@ pytest.importorskip("nerfstudio")
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.exposure import Exposures
+from beags_plugin.core.schedule import PhaseSchedule
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.losses.photometric import ssim
-from beags_plugin.options.schedule import PhaseSchedule
 from beags_plugin.plugin.training.monitor import HeldOutCurve
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
