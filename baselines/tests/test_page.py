@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from beags_plugin.refiners import BASELINES, make_refiner
+from beags_plugin.refiners import make_refiner
 
 FOLDER = Path(__file__).resolve().parents[1]
 PAGE = FOLDER / "README.md"
@@ -38,10 +38,9 @@ class Silent:
     level: int = 1
 
 
-def test_every_method_has_a_row_and_is_named_where_it_is_not_installed():
+def test_every_method_has_a_row():
     methods = PAGE.read_text("utf8").partition("## Options")[0]
     assert re.findall(r"^\| `([\w-]+)` \|", methods, re.MULTILINE) == sorted(installed())
-    assert sorted(BASELINES) == sorted(installed())
 
 
 def test_the_command_of_the_page_chooses_a_refiner_and_its_options():

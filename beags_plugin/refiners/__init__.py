@@ -12,12 +12,6 @@ from beags_plugin.system.registry import Registry
 if TYPE_CHECKING:
     from beags_plugin.preparation.refiner import Refiner
 
-BASELINES = (
-    *("cob-gs", "dr-splat", "flashsplat", "gaussian-grouping", "gaussiancut", "ilgs", "instascene", "objectgs"),
-    *("opengaussian", "sagd", "trace3d", "unified-lift"),
-)
-"""Methods of other papers, in a distribution of their own."""
-
 REFINERS = Registry(
     "refiner",
     "beags.refiners",
@@ -25,7 +19,7 @@ REFINERS = Registry(
         "bea": "beags_plugin.refiners.bea:BeaRefiner",
         "none": "beags_plugin.refiners.none:NoRefiner",
     },
-    elsewhere=dict.fromkeys(BASELINES, "pip install ./baselines"),
+    others="; other papers' methods come with beags-baselines (pip install ./baselines in a clone of beags)",
 )
 
 

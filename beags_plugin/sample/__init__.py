@@ -9,5 +9,5 @@ FAMILIES = Registry(
         "desk": "beags_plugin.sample.desk:DESK",
         "tabletop": "beags_plugin.sample.lighting:TABLETOP",
     },
-    elsewhere=dict.fromkeys(("room", "turntable"), "pip install ./benchmarks"),
+    others="; those of the experiments come with beags-benchmarks (pip install ./benchmarks in a clone of beags)",
 )

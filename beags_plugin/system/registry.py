@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
@@ -21,16 +20,15 @@ class Registry:
 
     kind: the user's word for an entry ("rasterizer"). group: the entry-point group in which other packages add their
     own, e.g. ``beags.rasterizers``. builtin: name to spec of the entries of this package; an entry point of the same
-    name is refused. elsewhere: name to the command that installs the distribution with that entry.
+    name is refused. others: where more entries come from; the message about an unknown name ends with it as long as no
+    package has added any.
     """
 
-    def __init__(
-        self, kind: str, group: str, builtin: dict[str, str], elsewhere: Mapping[str, str] | None = None
-    ) -> None:
+    def __init__(self, kind: str, group: str, builtin: dict[str, str], others: str = "") -> None:
         self.kind = kind
         self.group = group
         self._specs = dict(builtin)
-        self._elsewhere = elsewhere or {}
+        self._builtin, self._others = frozenset(builtin), others
         self._discovered = False
 
     def _discover(self) -> None:
@@ -55,11 +53,8 @@ class Registry:
 
     def check(self, name: str, *besides: str) -> None:
         """Raise ``UserError`` unless ``name`` is registered, or is one of ``besides``; imports nothing."""
-        if name in self._elsewhere and name not in self.names():
-            raise UserError(
-                f"the {self.kind} {name!r} is not part of beags itself: run {self._elsewhere[name]} in a clone of it."
-            )
-        check_choice(name, [*besides, *self.names()], self.kind)
+        names = self.names()
+        check_choice(name, [*besides, *names], self.kind, more=self._others if self._builtin.issuperset(names) else "")
 
     def get(self, name: str) -> Any:
         """Import and return what ``name`` stands for; raises ``UserError`` for an unknown name or a spec that fails."""
