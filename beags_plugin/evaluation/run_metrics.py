@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.color_fit import affine_color_fit, apply_affine
+from beags_plugin.core.lifting import hides
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.select import remove_class, select_class
 from beags_plugin.core.surfels import Surfels
@@ -30,7 +31,6 @@ from beags_plugin.evaluation.records import (
     ViewRecord,
 )
 from beags_plugin.evaluation.removal import removal_metrics
-from beags_plugin.evaluation.shown import TAU
 from beags_plugin.evaluation.truths import (
     extracted_truth,
     object_pixels,
@@ -221,7 +221,7 @@ class MaskRenderer:
     def _extracted(self, members: Membership, class_id: int, others: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """Return [H, W] bool, alpha of the object alone above the threshold, and the ``others`` that may hide it.
 
-        Behind a pixel of another object, by more than ``TAU`` of the depth, the truth is unknown. The object is wrong
+        Where the scene hides the object in a pixel of another one, the truth is unknown. The object is wrong
         there if it is rendered in front of the other one, inside it, or by the whole scene in its place.
         """
         if class_id not in self._alone:
@@ -231,7 +231,7 @@ class MaskRenderer:
                 return torch.zeros(camera.height, camera.width, dtype=torch.bool), None
             render = self._render(part, depth=others is not None)
             if others is not None:
-                nearer = self._scene_depth < (1.0 - TAU) * surface_depth(render, "median")
+                nearer = hides(self._scene_depth, surface_depth(render, "median"))
                 nearer &= ~self._rendered(members, [class_id])[class_id]
                 hidden = others & resized(nearer.cpu(), *others.shape)
             self._alone[class_id] = render.alpha > self.protocol.threshold, hidden

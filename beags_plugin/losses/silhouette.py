@@ -85,6 +85,7 @@ class SilhouetteLoss(Loss):
         # Thin parts have no median depth; their expected depth shows where they are.
         depth = torch.where(alone.median_depth > 0, alone.median_depth, alone.depth).detach()
         scene_depth = inputs.render.median_depth.detach()
+        # The margin is a share of the scene's depth, not of the object's as in ``hides``, which would change training.
         hidden = (scene_depth > 0) & (depth > (1.0 + TAU) * scene_depth)
         outside = known & (inputs.labels != class_id) & ~hidden
         if self.seen > 0:

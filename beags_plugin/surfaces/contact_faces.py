@@ -58,7 +58,7 @@ class Witnesses:
         surface = torch.where(surface > 0, surface, torch.inf)
         other = (label != self._class_ids) & (label != IGNORE)
         is_object = other & (label != BACKGROUND)
-        self.hidden += faces & is_object & (surface < z)
+        self.hidden += faces & is_object & (surface < z)  # Objects touch: any distance counts.
         self.open += faces & other & ((surface >= (1.0 + TAU) * z) | (~is_object & hides(surface, z)))
 
     def in_contact(self) -> Tensor:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.core.lifting import TAU, lift, project
+from beags_plugin.core.lifting import hides, lift, project
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth, surfel_inputs
 from beags_plugin.surfaces.close_up import close_up
@@ -144,8 +144,7 @@ def _draw(surfels: Surfels, camera: Camera, views: Viewpoints, low: Tensor, high
     inside = ((points >= low) & (points <= high)).all(dim=-1) & (render.alpha > _SOLID)
     if views.scene is not None:
         whole = views.rasterizer.rasterize(geometry_inputs(views.scene), camera, views.settings, black)
-        scene_depth = surface_depth(whole, "median")
-        inside &= (scene_depth == 0) | (own_depth <= (1.0 + TAU) * scene_depth)
+        inside &= ~hides(surface_depth(whole, "median"), own_depth)
     depth = torch.where(inside, own_depth, 0.0)
     # Dividing by alpha removes the black background.
     return depth, (render.color / render.alpha.clamp(min=_SOLID)[..., None]).clamp(0.0, 1.0)
