@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -12,7 +12,6 @@ from beags_plugin.commands.answers import CONSOLE, write_json
 from beags_plugin.commands.starting import starting
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.export.pose_options import PoseOptions
-from beags_plugin.export.splat_options import SplatOptions
 from beags_plugin.pictures.options import RenderOptions
 from beags_plugin.surfaces.mesh_options import MeshOptions
 from beags_plugin.system.errors import UserError
@@ -56,6 +55,24 @@ class Extract:
             CONSOLE.print(f"  beags view {quoted(done.config.parent)}")
         for sentence in sentences:
             CONSOLE.print(sentence)
+
+
+@dataclass(frozen=True)
+class SplatOptions:
+    """Options of splat files."""
+
+    spz_version: Literal[3, 4] = 3
+    """Version of .spz: 3, which most readers support, or 4, which is slightly smaller."""
+    surflets: bool = False
+    """USD: write discs as surflets, which are invisible from the side, instead of thin 3D Gaussians, which all programs
+    with splats can render."""
+    usd_up: Literal["y", "z"] = "y"
+    """USD of splats: the axis that is up."""
+
+    def of_formats(self, mesh: MeshOptions) -> dict[str, dict[str, Any]]:
+        """Return the options of exporters by their names; mesh: options of colliders."""
+        usd = {"kernel": "surflet" if self.surflets else "ellipsoid", "up_axis": self.usd_up, "mesh": mesh}
+        return {"spz": {"version": self.spz_version}, "usdz-splats": usd, "usda-splats": usd}
 
 
 @dataclass
