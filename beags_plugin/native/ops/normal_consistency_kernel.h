@@ -2,8 +2,8 @@
 // instruction set.
 #pragma once
 
+#include "ops/lanes.h"
 #include "ops/normal_consistency_terms.h"
-#include "simd/row_vectors.h"
 
 namespace beags {
 namespace ops {

@@ -4,11 +4,11 @@
 #pragma once
 
 #include "ops/kernels.h"
+#include "ops/lanes.h"
 #include "ops/occupancy_loss_random.h"
 #include "ops/occupancy_loss_terms.h"
 #include "ops/voxel_table.h"
 #include "rasterizer/quaternion.h"
-#include "simd/lanes.h"
 
 namespace beags {
 namespace ops {
@@ -30,18 +30,6 @@ struct OccupancyBatch {
   int count;
 };
 
-template <class T>
-BEAGS_INLINE typename Lanes<T>::Real load(const T* from) {
-  typename Lanes<T>::Real vector;
-  __builtin_memcpy(&vector, from, sizeof vector);
-  return vector;
-}
-
-template <class T>
-BEAGS_INLINE void store(T* to, typename Lanes<T>::Real vector) {
-  __builtin_memcpy(to, &vector, sizeof vector);
-}
-
 // The voxels that a batch's discs reach: `size` voxels along each axis, from `low`; `largest` is the largest size, or
 // larger than any window if a disc is too far away to be looked up.
 template <class T>
@@ -51,8 +39,8 @@ struct Boxes {
 
 // Gathers from[kStride * lane].
 template <int kStride, class T>
-BEAGS_INLINE typename Lanes<T>::Real strided(const T* from) {
-  typename Lanes<T>::Real out;
+BEAGS_INLINE RealOf<T> strided(const T* from) {
+  RealOf<T> out;
   for (int lane = 0; lane < Lanes<T>::kCount; ++lane) out[lane] = from[kStride * lane];
   return out;
 }
@@ -60,7 +48,7 @@ BEAGS_INLINE typename Lanes<T>::Real strided(const T* from) {
 // The parameters of one Gaussian a lane.
 template <class T>
 struct Parameters {
-  typename Lanes<T>::Real mean[3], quat[4], log_scale[2], logit;
+  RealOf<T> mean[3], quat[4], log_scale[2], logit;
 
   // Reads neighbours, from `first`.
   BEAGS_INLINE Parameters(const OccupancyJob<T>& job, int64_t first) {
@@ -93,8 +81,8 @@ BEAGS_INLINE Parameters<T> parameters(const OccupancyJob<T>& job, int64_t first,
 
 // The discs of one Gaussian a lane. All is inlined, so that unused results cost nothing.
 template <class T>
-struct Discs : DiscFrame<typename Lanes<T>::Real> {
-  using R = typename Lanes<T>::Real;
+struct Discs : DiscFrame<RealOf<T>> {
+  using R = RealOf<T>;
   using Frame = DiscFrame<R>;
   using Frame::inverse_length, Frame::r0, Frame::r1, Frame::scale;
 
@@ -122,7 +110,7 @@ struct Discs : DiscFrame<typename Lanes<T>::Real> {
 
 template <class T>
 BEAGS_INLINE Boxes<T> boxes_around(const Discs<T>& discs) {
-  using R = typename Lanes<T>::Real;
+  using R = RealOf<T>;
   const R zero = {};
   Boxes<T> boxes;
   boxes.largest = typename Lanes<T>::Int{};
@@ -142,8 +130,8 @@ BEAGS_INLINE Boxes<T> boxes_around(const Discs<T>& discs) {
 // Writes the gradients of a batch from its six sums; returns the sum of its losses.
 template <class T>
 BEAGS_INLINE double finish(const OccupancyJob<T>& job, const OccupancyBatch<T>& batch, const Discs<T>& discs,
-                           typename Lanes<T>::Real opacity, const typename Lanes<T>::Real* sums) {
-  using R = typename Lanes<T>::Real;
+                           RealOf<T> opacity, const RealOf<T>* sums) {
+  using R = RealOf<T>;
   constexpr int kCount = Lanes<T>::kCount;
   T value[kCount];
   store(value, opacity * sums[0]);
@@ -168,7 +156,7 @@ BEAGS_INLINE double finish(const OccupancyJob<T>& job, const OccupancyBatch<T>& 
 // Samples a batch and sums G Q times 1, u, v, u^2, v^2, u v.
 template <Reach kReach, class T>
 BEAGS_INLINE double sample(const OccupancyJob<T>& job, OccupancyBatch<T>& batch) {
-  using R = typename Lanes<T>::Real;
+  using R = RealOf<T>;
   using I = typename Lanes<T>::Int;
   constexpr int kCount = Lanes<T>::kCount;
   for (int lane = batch.count; lane < kCount; ++lane) {  // Copies fill the spare lanes.

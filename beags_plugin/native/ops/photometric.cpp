@@ -3,7 +3,7 @@
 #include <memory>
 #include <vector>
 
-#include "simd/two_builds.h"
+#include "ops/two_builds.h"
 
 namespace beags {
 namespace ops {

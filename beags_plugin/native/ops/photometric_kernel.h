@@ -3,8 +3,8 @@
 // few buffers that stay in the cache, then along the row, where the window steps over the interleaved channels.
 #pragma once
 
+#include "ops/lanes.h"
 #include "ops/photometric_terms.h"
-#include "simd/row_vectors.h"
 
 namespace beags {
 namespace ops {

@@ -6,7 +6,7 @@
 #if defined(__CUDACC__) || defined(BEAGS_CUDA_EMULATION)
 #include "simd/scalar_math.h"
 #else
-#include "simd/lanes.h"
+#include "ops/lanes.h"
 #endif
 
 namespace beags {

@@ -4,7 +4,7 @@
 
 #define BEAGS_ISA baseline
 #include "ops/reprojection_votes_terms.h"
-#include "simd/two_builds.h"
+#include "ops/two_builds.h"
 
 namespace beags {
 namespace ops {

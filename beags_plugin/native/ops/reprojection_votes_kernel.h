@@ -2,8 +2,8 @@
 // set, with -ffp-contract=off.
 #pragma once
 
+#include "ops/lanes.h"
 #include "ops/reprojection_votes_terms.h"
-#include "simd/lanes.h"
 
 namespace beags {
 namespace ops {
@@ -11,7 +11,7 @@ namespace BEAGS_ISA {
 
 template <class T>
 void cast_row(const CastJob<T>& job, int y, const T* depth, const int32_t* labels) {
-  using R = typename Lanes<T>::Real;
+  using R = RealOf<T>;
   using I = typename Lanes<T>::Int;
   constexpr int kCount = Lanes<T>::kCount;
   const T row = static_cast<T>(y) + T(0.5);

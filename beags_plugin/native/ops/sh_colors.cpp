@@ -2,7 +2,7 @@
 
 #include <algorithm>
 
-#include "simd/two_builds.h"
+#include "ops/two_builds.h"
 
 namespace beags {
 namespace ops {

@@ -6,7 +6,7 @@
 #include "ops/photometric_kernel.h"
 #include "ops/reprojection_votes_kernel.h"
 #include "ops/sh_colors_kernel.h"
-#include "simd/two_builds.h"
+#include "ops/two_builds.h"
 
 namespace beags {
 namespace ops {

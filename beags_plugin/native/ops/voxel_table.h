@@ -6,8 +6,8 @@
 #include <math.h>
 #include <stdint.h>
 
+#include "ops/hash.h"
 #include "simd/device.h"
-#include "simd/hash.h"
 
 namespace beags {
 namespace ops {

@@ -2,9 +2,9 @@
 // instruction set.
 #pragma once
 
+#include "rasterizer/packs.h"
 #include "rasterizer/pixel_terms.h"
 #include "rasterizer/types.h"
-#include "simd/simd.h"
 
 namespace beags {
 namespace BEAGS_ISA {

@@ -7,7 +7,7 @@
 #if defined(__CUDACC__) || defined(BEAGS_CUDA_EMULATION)
 #include "simd/scalar_math.h"
 #else
-#include "simd/simd.h"
+#include "rasterizer/packs.h"
 #endif
 
 namespace beags {

@@ -1,5 +1,5 @@
-// Defines, for GPUs and on single numbers, the operations that simd.h and lanes.h define on vectors: code that the CPU
-// and GPUs share calls them by these names.
+// Defines, for GPUs and on single numbers, the operations that the rasterizer's packs.h and the ops' lanes.h define on
+// vectors: code that the CPU and GPUs share calls them by these names.
 #pragma once
 
 #include <math.h>  // fma, sqrt and exp2, also for float

@@ -1,6 +1,7 @@
 // Defines vectors of 16 or 32 bytes as GCC's and clang's vector extensions, which any instruction set can lower: the
-// registers of the tile kernels (simd.h) and the lanes of the ops (lanes.h). Files that include it are compiled for one
-// instruction set each, so everything lies in the namespace BEAGS_ISA; otherwise the linker would merge the copies.
+// registers of the tile kernels (rasterizer/packs.h) and the lanes of the ops (ops/lanes.h). Files that include it are
+// compiled for one instruction set each, so everything lies in the namespace BEAGS_ISA; otherwise the linker would
+// merge the copies.
 #pragma once
 
 #include <math.h>

@@ -1,5 +1,5 @@
-// Defines what the ops' kernels compute on vectors of 32 bytes, 8 float32 or 4 float64 lanes (vectors.h), on any
-// instruction set.
+// Defines what the ops' kernels compute on vectors of 32 bytes (simd/vectors.h), 8 float32 or 4 float64 lanes on any
+// instruction set, and walks a row of numbers, vector by vector.
 #pragma once
 
 #include "simd/vectors.h"
@@ -8,19 +8,30 @@ namespace beags {
 namespace ops {
 namespace BEAGS_ISA {
 
-typedef uint64_t Words __attribute__((vector_size(32)));
-
 template <class T>
 using Lanes = beags::BEAGS_ISA::Vectors<T, 32>;
+template <class T>
+using RealOf = typename Lanes<T>::Real;
 
-using RealF = Lanes<float>::Real;
+using RealF = RealOf<float>;
 using IntF = Lanes<float>::Int;
-using RealD = Lanes<double>::Real;
+using RealD = RealOf<double>;
 using IntD = Lanes<double>::Int;
 
 using beags::BEAGS_ISA::fused;
 using beags::BEAGS_ISA::root;
 using beags::BEAGS_ISA::select;
+
+template <class T>
+BEAGS_INLINE RealOf<T> load(const T* from) {
+  RealOf<T> value;
+  __builtin_memcpy(&value, from, sizeof value);
+  return value;
+}
+template <class T>
+BEAGS_INLINE void store(T* to, RealOf<T> value) {
+  __builtin_memcpy(to, &value, sizeof value);
+}
 
 BEAGS_INLINE RealF fma(RealF a, RealF b, RealF c) { return fused(a, b, c); }
 BEAGS_INLINE RealD fma(RealD a, RealD b, RealD c) { return fused(a, b, c); }
@@ -48,8 +59,8 @@ BEAGS_INLINE auto floor_to_int(R x) {
   return wrapping_sum(whole, to_real(whole) > x);
 }
 
-// Returns e^x to 2 units in the last place; 0 below -87, infinity above 88. simd.h's exp2 is another polynomial, less
-// accurate and faster.
+// Returns e^x to 2 units in the last place; 0 below -87, infinity above 88. The exp2 of the rasterizer's
+// packs.h is another polynomial, less accurate and faster.
 BEAGS_INLINE RealF exponential(RealF x) {
   const RealF zero = {};
   const IntF tiny = x < -87.0f, huge = x > 88.0f;
@@ -73,33 +84,45 @@ BEAGS_INLINE RealD exponential(RealD x) {
   return x;
 }
 
-// Computes cosine and sine of angle / 2^24 turns, 0 <= angle < 2^24. Quarter turns are taken off exactly, in integers.
-BEAGS_INLINE void cos_sin(IntF angle, RealF& cosine, RealF& sine) {
-  const RealF zero = {};
-  const IntF quarter = (angle + (1 << 21)) >> 22;
-  const RealF x = to_real(angle - (quarter << 22)) * 3.74507029e-7f;  // 2 pi / 2^24; |x| <= pi / 4
-  const RealF x2 = x * x;
-  RealF s = zero + 1.0f / 362880;
-  s = fma(s, x2, zero - 1.0f / 5040);
-  s = fma(s, x2, zero + 1.0f / 120);
-  s = fma(s, x2, zero - 1.0f / 6);
-  s = fma(s * x2, x, x);
-  RealF c = zero + 1.0f / 40320;
-  c = fma(c, x2, zero - 1.0f / 720);
-  c = fma(c, x2, zero + 1.0f / 24);
-  c = fma(c, x2, zero - 0.5f);
-  c = fma(c, x2, zero + 1.0f);
-  const IntF odd = -(quarter & 1);
-  const IntF sign_c = ((quarter + 1) & 2) << 30, sign_s = (quarter & 2) << 30;
-  cosine = (RealF)((IntF)select(odd, s, c) ^ sign_c);
-  sine = (RealF)((IntF)select(odd, c, s) ^ sign_s);
-}
-BEAGS_INLINE void cos_sin(IntD angle, RealD& cosine, RealD& sine) {
-  for (int i = 0; i < 4; ++i) {
-    const double x = static_cast<double>(angle[i]) * 3.745070282923929e-07;
-    cosine[i] = cos(x);
-    sine[i] = sin(x);
+// The lanes of a vector inside the row: all of them, or `count`; others hold zeros.
+struct Whole {
+  template <class T>
+  BEAGS_INLINE static int size() {
+    return Lanes<T>::kCount;
   }
+  template <class T>
+  BEAGS_INLINE static RealOf<T> load(const T* from) {
+    return ops::BEAGS_ISA::load(from);
+  }
+  template <class T>
+  BEAGS_INLINE static void store(T* to, RealOf<T> value) {
+    ops::BEAGS_ISA::store(to, value);
+  }
+};
+struct Part {
+  int64_t count;
+  template <class T>
+  BEAGS_INLINE int size() const {
+    return static_cast<int>(count);
+  }
+  template <class T>
+  BEAGS_INLINE RealOf<T> load(const T* from) const {
+    RealOf<T> value = {};
+    for (int64_t i = 0; i < count; ++i) value[i] = from[i];
+    return value;
+  }
+  template <class T>
+  BEAGS_INLINE void store(T* to, RealOf<T> value) const {
+    for (int64_t i = 0; i < count; ++i) to[i] = value[i];
+  }
+};
+
+// Calls visit(first number, lanes) for every vector of a row of `line` numbers.
+template <class T, class Visit>
+BEAGS_INLINE void for_each_vector(int64_t line, Visit visit) {
+  int64_t i = 0;
+  for (; i + Lanes<T>::kCount <= line; i += Lanes<T>::kCount) visit(i, Whole{});
+  if (i < line) visit(i, Part{line - i});
 }
 
 }  // namespace BEAGS_ISA

@@ -1,4 +1,4 @@
-// One lane: the same kernels without SIMD, the base of comparisons. See simd.h.
+// One lane: the same kernels without SIMD, the base of comparisons. See packs.h.
 #pragma once
 
 namespace beags {

@@ -1,7 +1,7 @@
-// Defines vectors of the instruction set that the including file is compiled for, for the rasterizer. A Real holds
-// kParts<T> registers that run in step: that hides latencies and shares what is the same for all of them. Only the
-// files of tile kernels include it, and everything lies in the namespace BEAGS_ISA; otherwise the linker would merge
-// the copies.
+// Defines packs of pixels for the tile kernels, in the registers of the instruction set that the including file is
+// compiled for (registers_*.h). A Real holds kParts<T> registers that run in step: that hides latencies and shares what
+// is the same for all of them. Only the files of tile kernels include it, and everything lies in the namespace
+// BEAGS_ISA; otherwise the linker would merge the copies.
 #pragma once
 
 #include <math.h>
@@ -15,11 +15,11 @@
 #define BEAGS_UNROLL _Pragma("GCC unroll 4")
 
 #if defined(BEAGS_SCALAR)
-#include "simd/simd_scalar.h"
+#include "rasterizer/registers_scalar.h"
 #elif defined(__AVX512F__)
-#include "simd/simd_avx512.h"
+#include "rasterizer/registers_avx512.h"
 #else
-#include "simd/simd_vectors.h"
+#include "rasterizer/registers_vectors.h"
 #endif
 
 namespace beags {

@@ -1,5 +1,5 @@
 // Registers of the tile kernels as vector extensions: of 32 bytes for AVX2 with FMA, of 16 for SSE2, NEON or whatever
-// the processor has. See simd.h.
+// the processor has. See packs.h.
 #pragma once
 
 #include "simd/vectors.h"

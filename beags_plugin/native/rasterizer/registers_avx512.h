@@ -1,4 +1,4 @@
-// Registers of AVX-512: 16 float32 lanes, one group of 4 x 4 pixels, or 8 float64 lanes. See simd.h.
+// Registers of AVX-512: 16 float32 lanes, one group of 4 x 4 pixels, or 8 float64 lanes. See packs.h.
 #pragma once
 
 namespace beags {
