@@ -20,7 +20,7 @@ from beags_plugin.export.base import Exporter
 from beags_plugin.export.glb import add_mesh
 from beags_plugin.export.gltf import FLOAT, UNSIGNED_BYTE, Document, glb_to_world, positions
 from beags_plugin.export.mesh import TexturedExporter
-from beags_plugin.export.splat_parts import SplatPart, splat_parts, without_invented, y_up_surfels
+from beags_plugin.export.splat_parts import SplatPart, splat_parts, without_invented, y_up_gaussians
 from beags_plugin.splat_io.files import write_bytes
 from beags_plugin.splat_io.ply import thin_log_scales
 from beags_plugin.surfaces.item import ExportItem
@@ -94,7 +94,7 @@ def add_splats(document: Document, part: SplatPart, name: str = "") -> int:
 
     They have z up and the file y: positions, rotations and colours are turned.
     """
-    turned = y_up_surfels(part.surfels)
+    turned = y_up_gaussians(part.surfels)
     floats = {
         "ROTATION": (torch.nn.functional.normalize(turned.quats.double(), dim=1)[:, [1, 2, 3, 0]], "VEC4"),
         "SCALE": (thin_log_scales(turned.log_scales.detach().double()).exp(), "VEC3"),

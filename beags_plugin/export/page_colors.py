@@ -20,7 +20,7 @@ _PIXELS = 256  # longer side of the images that weigh the views
 
 @dataclass(frozen=True)
 class SeenColors:
-    """Surfels of degree 0, and a view of them.
+    """Gaussians of degree 0, and a view of them.
 
     surfels: N, each with its colour in the training views. eye: [3] the position of the training camera that shows most
     of them. up: [3] the mean of the training cameras' upward directions, unit length.
@@ -32,10 +32,10 @@ class SeenColors:
 
 
 def seen_colors(surfels: Surfels, views: Viewpoints, on_render: Callable[[int], None]) -> SeenColors:
-    """Return each surfel's mean colour in the training views, weighted by its contributions to a close-up of each view.
+    """Return each Gaussian's mean colour in the training views, weighted by its contributions to their close-ups.
 
-    The degree-0 coefficient alone is the mean over all directions, most of which no photo shows. A surfel that no view
-    shows keeps it. surfels: N of one object. on_render: receives the number of views rendered.
+    The degree-0 coefficient alone is the mean over all directions, most of which no photo shows. A Gaussian that no
+    view shows keeps it. surfels: N of one object. on_render: receives the number of views rendered.
     """
     surfels = surfels.detach()
     low, high = bounding_box(surfels)

@@ -49,7 +49,7 @@ def without_invented(item: ExportItem) -> ExportItem:
     return replace(item, surfels=item.surfels[own], class_ids=item.class_ids[own], invented=None)
 
 
-def y_up_surfels(surfels: Surfels) -> Surfels:
-    """Return surfels of a frame with z up in one with y up: z becomes y, and y becomes -z."""
+def y_up_gaussians(surfels: Surfels) -> Surfels:
+    """Return Gaussians of a frame with z up in one with y up: z becomes y, and y becomes -z."""
     quarter = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]]
     return from_input_frame(surfels, torch.tensor(quarter, dtype=torch.float64), 1.0)

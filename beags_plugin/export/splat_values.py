@@ -21,7 +21,7 @@ class SplatValues:
     """N finite 3D Gaussians, along a Morton curve through their means; float64.
 
     means: [N, 3]. quats: [N, 4] wxyz, unit length. log_scales: [N, 3], the third ``THICKNESS`` times the smaller of
-    the surfel's two. opacities: [N] 0..1. sh_dc: [N, 3]. sh_rest: [N, (degree + 1)^2 - 1, 3].
+    the Gaussian's two. opacities: [N] 0..1. sh_dc: [N, 3]. sh_rest: [N, (degree + 1)^2 - 1, 3].
     """
 
     means: np.ndarray
@@ -36,7 +36,7 @@ class SplatValues:
 
 
 def finite_mask(surfels: Surfels) -> torch.Tensor:
-    """Return [N] bool, the surfels whose parameters are all finite."""
+    """Return [N] bool, the Gaussians whose parameters are all finite."""
     values = (surfels.means, surfels.quats, surfels.log_scales, surfels.sh)
     finite = torch.cat([value.detach().flatten(1) for value in values], dim=1).isfinite().all(dim=1)
     return finite & surfels.opacity_logits.isfinite()

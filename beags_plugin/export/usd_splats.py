@@ -23,7 +23,7 @@ from beags_plugin.core.surfels import opacities
 from beags_plugin.export.base import Exporter
 from beags_plugin.export.gltf import y_up
 from beags_plugin.export.mesh import MOST
-from beags_plugin.export.splat_parts import SplatPart, splat_parts, without_invented, y_up_surfels
+from beags_plugin.export.splat_parts import SplatPart, splat_parts, without_invented, y_up_gaussians
 from beags_plugin.export.usdz import define_mesh, modules, packed
 from beags_plugin.splat_io.files import write_bytes
 from beags_plugin.splat_io.ply import thin_log_scales
@@ -90,7 +90,7 @@ class UsdSplatsExporter(Exporter):
 
     def _define_splats(self, stage: Any, place: str, part: SplatPart) -> None:
         Gf, Sdf, UsdGeom, Vt = modules("Gf", "Sdf", "UsdGeom", "Vt")
-        surfels = y_up_surfels(part.surfels) if self.up_axis == "y" else part.surfels
+        surfels = y_up_gaussians(part.surfels) if self.up_axis == "y" else part.surfels
         scales = _floats(thin_log_scales(surfels.log_scales.detach().double()).exp())
         prim = self._field(stage, place)
         quats = torch.nn.functional.normalize(surfels.quats.double(), dim=1)[:, [1, 2, 3, 0]]  # The real part is last.

@@ -1,4 +1,4 @@
-"""Depth distortion: it pulls the surfels along a ray together (method, section 1; E4)."""
+"""Depth distortion: it pulls the Gaussians along a ray together (method, section 1; E4)."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from beags_plugin.objects.photos import photos_of
 from beags_plugin.objects.pose import plane_under
 from beags_plugin.objects.shown import Shown
 from beags_plugin.runs.read import SavedScene
-from beags_plugin.surfaces.closing_surfels import with_closing
+from beags_plugin.surfaces.closing_gaussians import with_closing
 from beags_plugin.surfaces.frames import Frame, bounding_box
 from beags_plugin.surfaces.ground_plane import turn_to_z
 from beags_plugin.surfaces.item import ExportItem, NothingToExport, Photo, Viewpoints

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from beags_plugin.cleaning.clean import LeftOut
-from beags_plugin.surfaces.closing_surfels import Added
+from beags_plugin.surfaces.closing_gaussians import Added
 from beags_plugin.system.wording import amount
 
 

@@ -73,7 +73,7 @@ class SurfaceGraph:
 
 
 def surface_graph(surfels: Surfels, seen: np.ndarray, normals: np.ndarray) -> SurfaceGraph:
-    """Return the graph of N surfels; ``seen`` [N] and ``normals`` [N, 3] as of ``sight.seen_from``; M may be 0."""
+    """Return the graph of N Gaussians; ``seen`` [N] and ``normals`` [N, 3] as of ``sight.seen_from``; M may be 0."""
     from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
 
     nodes = np.flatnonzero(seen > LEAST_WEIGHT)

@@ -40,13 +40,13 @@ def read_transform(run: Path) -> tuple[Tensor, float] | None:
 
 
 def to_input_frame(surfels: Surfels, transform: Tensor, scale: float) -> Surfels:
-    """Undo x' = scale (R x + t): return the same surfels in the frame of the input poses.
+    """Undo x' = scale (R x + t): return the same Gaussians in the frame of the input poses.
 
     Positions become R^T (x' / scale - t), rotations R^T R', scales are divided by ``scale``; the spherical harmonics
-    turn along, so that the surfels look the same.
+    turn along, so that the Gaussians look the same.
 
-    surfels: N surfels in the frame of x'. transform: [3, 4] float, R | t; R a rotation. scale: positive.
-    Returns N surfels of the same dtype and device. Raises ``UserError`` if R is no rotation or scale is not positive.
+    surfels: N Gaussians in the frame of x'. transform: [3, 4] float, R | t; R a rotation. scale: positive.
+    Returns N Gaussians of the same dtype and device. Raises ``UserError`` if R is no rotation or scale is not positive.
     """
     rotation, translation = _checked(transform, scale, surfels.means)
     means = (surfels.means.detach().double() / scale - translation) @ rotation  # rows: R^T (x' / scale - t)
@@ -54,9 +54,9 @@ def to_input_frame(surfels: Surfels, transform: Tensor, scale: float) -> Surfels
 
 
 def from_input_frame(surfels: Surfels, transform: Tensor, scale: float) -> Surfels:
-    """Return the same surfels in the frame of x' = scale (R x + t): undo ``to_input_frame``.
+    """Return the same Gaussians in the frame of x' = scale (R x + t): undo ``to_input_frame``.
 
-    surfels: N surfels in the frame of the input poses; the rest as of ``to_input_frame``.
+    surfels: N Gaussians in the frame of the input poses; the rest as of ``to_input_frame``.
     """
     rotation, translation = _checked(transform, scale, surfels.means)
     means = scale * (surfels.means.detach().double() @ rotation.T + translation)
@@ -80,7 +80,7 @@ def _checked(transform: Tensor, scale: float, like: Tensor) -> tuple[Tensor, Ten
 
 
 def _turned(surfels: Surfels, means: Tensor, rotation: Tensor, factor: float) -> Surfels:
-    """Return the surfels at ``means`` [N, 3] float64, turned by ``rotation`` [3, 3] and ``factor`` times as large."""
+    """Return the Gaussians at ``means`` [N, 3] float64, turned by ``rotation`` [3, 3] and ``factor`` times as large."""
     dtype = surfels.means.dtype
     return Surfels.of(
         means=means.to(dtype),

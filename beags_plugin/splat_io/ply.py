@@ -32,15 +32,15 @@ def write_ply(
     layout: Literal["3dgs", "2dgs"] = "3dgs",
     invented: Tensor | None = None,
 ) -> None:
-    """Write surfels as a binary splat .ply: 3DGS's or 2DGS's columns, then ``class_id`` (int32) if there are class ids.
+    """Write Gaussians as a binary splat .ply: columns of 3DGS or 2DGS, and ``class_id`` (int32) if there are class ids.
 
-    Columns: x y z; nx ny nz, the surfel's normal; f_dc_0..2; f_rest_* channel-major (red, then green, then blue);
+    Columns: x y z; nx ny nz, the Gaussian's normal; f_dc_0..2; f_rest_* channel-major (red, then green, then blue);
     opacity as a logit; scale_0..2 as logs, the third ``THICKNESS`` times the smaller of the two for viewers of 3D
     Gaussians; rot_0..3 wxyz, unit length. The layout of 2DGS has two scales, 45 f_rest columns padded with 0, because
     the official code expects SH degree 3, and a comment for PlayCanvas' programs.
 
-    surfels: N surfels. class_ids: [N] integer, phi. transform: the dataparser's ([3, 4], scale); with it the
-    file is in the frame of the input poses, without it in the surfels' own. invented: [N] bool, the last column, of
+    surfels: N Gaussians. class_ids: [N] integer, phi. transform: the dataparser's ([3, 4], scale); with it the
+    file is in the frame of the input poses, without it in the Gaussians' own. invented: [N] bool, the last column, of
     uchar 0 or 1. Raises ``UserError`` if the file cannot be written.
     """
     if transform is not None:

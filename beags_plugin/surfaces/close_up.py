@@ -10,7 +10,7 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.lifting import project
 
-_MARGIN = 2  # pixels around the box, because surfels reach beyond one standard deviation
+_MARGIN = 2  # pixels around the box, because Gaussians reach beyond one standard deviation
 
 
 def close_up(camera: Camera, low: Tensor, high: Tensor, near: float, pixels: int) -> Camera:

@@ -19,7 +19,7 @@ from beags_plugin.core.select import select_class
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
-from beags_plugin.surfaces.closing_surfels import closing_gaussians, joined
+from beags_plugin.surfaces.closing_gaussians import closing_gaussians, joined
 from beags_plugin.surfaces.item import ExportItem, Viewpoints
 from beags_plugin.surfaces.mesh_options import MeshOptions
 

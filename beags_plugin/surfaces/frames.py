@@ -14,7 +14,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.splat_io.frames import to_input_frame
 from beags_plugin.surfaces.item import Viewpoints
 
-_BULK = 0.01  # share of the surfels at each side that the size of the item leaves out, because some are strays
+_BULK = 0.01  # share of the Gaussians at each side that the size of the item leaves out, because some are strays
 _FENCE = 0.5  # distance beyond the bulk, over its longest side, within which thin parts still count
 
 
@@ -53,7 +53,7 @@ class Frame:
         return (points / self.scale - self.transform[:, 3]) @ self.transform[:, :3]
 
     def surfels(self, surfels: Surfels) -> Surfels:
-        """Return surfels of the run's frame in this one."""
+        """Return Gaussians of the run's frame in this one."""
         return to_input_frame(surfels, self.transform, self.scale)
 
     def camera(self, camera: Camera) -> Camera:
@@ -81,10 +81,10 @@ class Frame:
 
 
 def bounding_box(surfels: Surfels) -> tuple[Tensor, Tensor]:
-    """Return the box of N surfels' ellipses of one standard deviation, without strays far from the others.
+    """Return the box of N Gaussians' ellipses of one standard deviation, without strays far from the others.
 
-    It reaches at most half the bulk's longest side beyond the bulk, which leaves out 1 % at each side. Surfels that are
-    not finite do not count; without any, the box is the origin. Returns (low [3], high [3]) float64, in their frame.
+    It reaches at most half the bulk's longest side beyond the bulk, which leaves out 1 % at each side. Gaussians that
+    are not finite do not count; without any, the box is the origin. Returns (low [3], high [3]) float64, in its frame.
     """
     axes = rotation_from_quat(surfels.quats.detach().double())[:, :, :2]
     # A disc's reach along a world axis is the length of its two half axes' components there.

@@ -91,7 +91,7 @@ def fuse(
 ) -> Mesh:
     """Fuse the surface that at least ``min_views`` of the views show of an object rendered alone, or in its scene.
 
-    surfels: N surfels, in the frame of the views. resolution: voxels along the longest side of their box; renders are
+    surfels: N Gaussians, in the frame of the views. resolution: voxels along the longest side of their box; renders are
     close-ups of it, ``PIXELS_PER_VOXEL`` times as many pixels long. truncation: voxels on either side of the surface
     that a view changes. memory_mb: bound of the grid, 10^6 bytes. on_render: receives the number of views done. Returns
     a mesh, perhaps without faces, whose order does not depend on the number of threads.

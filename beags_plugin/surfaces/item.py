@@ -53,13 +53,13 @@ class Photo:
 class ExportItem:
     """An object or the background to export, in the frame of the file.
 
-    name: the user's name of it. surfels: N surfels. class_ids: [N] int32, phi.
+    name: the user's name of it. surfels: N Gaussians. class_ids: [N] int32, phi.
     views: those of the training photos; None unless an exporter ``needs_views``.
     photos: those of the item; None unless an exporter ``needs_photos``, or if there are none, for the reason
         ``no_photos``.
     in_metres: whether the frame's unit is the metre; otherwise it is unknown.
     close: whether meshes shall be closed where no photo shows the item.
-    invented: [N] bool, surfels that close it there; None if it was not to be closed.
+    invented: [N] bool, Gaussians that close it there; None if it was not to be closed.
     class_names: the names of ``class_ids``, for files that hold several objects.
     shared: results that exporters of one item share, such as the mesh of two file types.
     on_render: an exporter that ``needs_views`` calls it with the number of views rendered so far.

@@ -20,7 +20,7 @@ from beags_plugin.commands.cli import main
 from beags_plugin.commands.made_masks import SALIENT
 from beags_plugin.importers.base import read_scene
 from beags_plugin.objects.written_back import changes, format_of
-from beags_plugin.surfaces.closing_surfels import joined
+from beags_plugin.surfaces.closing_gaussians import joined
 
 
 @pytest.mark.slow("refines a scene of another program")

@@ -29,7 +29,7 @@ from beags_plugin.export import usdz
 from beags_plugin.export.base import make_exporter
 from beags_plugin.importers.base import read_scene
 from beags_plugin.splat_io.ply import THICKNESS
-from beags_plugin.surfaces.closing_surfels import with_closing
+from beags_plugin.surfaces.closing_gaussians import with_closing
 from beags_plugin.surfaces.item import ExportItem, NothingToExport
 from beags_plugin.surfaces.mesh_options import MeshOptions
 from beags_plugin.system.errors import UserError

@@ -23,7 +23,7 @@ from beags_plugin.export.glb import glb_bytes
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import surfel_inputs
 from beags_plugin.surfaces.closing import Closed, closed
-from beags_plugin.surfaces.closing_surfels import _within, closing_surfels, with_closing
+from beags_plugin.surfaces.closing_gaussians import _within, gaussians_on, with_closing
 from beags_plugin.surfaces.fusion import Mesh, decimated
 from beags_plugin.surfaces.item import ExportItem, NothingToExport, Viewpoints
 from beags_plugin.surfaces.mesh_options import MeshOptions
@@ -104,16 +104,16 @@ def test_a_closed_hole_has_the_colours_of_its_rim():
 
 def test_gaussians_close_the_hole_and_are_its_only_new_ones():
     surfels = discs_on(a_box(bottom=False))
-    more = closing_surfels(closed_box(), surfels, 0.0)
+    more = gaussians_on(closed_box(), surfels, 0.0)
     assert 50 < len(more) < 2000 and more.sh_degree == 1 and not more.sh_rest.any()
     assert (more.means[:, 2] + HALF).abs().max() < 2 * VOXEL
     normals = rotation_from_quat(more.quats)[:, :, 2]
     inner = more.means[:, :2].abs().amax(dim=1) < HALF - 0.1
     assert inner.any() and normals[inner, 2].max() < -0.99  # outwards
     assert more.log_scales[inner].mean() > more.log_scales[~inner].mean() and opacities(more.opacity_logits).min() > 0.9
-    again = closing_surfels(closed_box(), surfels, 0.0)
+    again = gaussians_on(closed_box(), surfels, 0.0)
     assert torch.equal(again.means, more.means) and torch.equal(again.sh_dc, more.sh_dc)
-    coarse = closing_surfels(closed_box(), surfels, 0.06)  # a pixel of three voxels
+    coarse = gaussians_on(closed_box(), surfels, 0.06)  # a pixel of three voxels
     assert 20 < len(coarse) < len(more) and coarse.means[:, :2].abs().max() < more.means[:, :2].abs().max()
     camera = camera_at((0.2, 0.3, -3.0))
     rasterizer = make_rasterizer("auto")
@@ -158,7 +158,7 @@ def test_an_item_is_closed_and_says_which_gaussians_are_invented():
 
 def test_a_closed_surface_that_wants_no_gaussian_adds_none(monkeypatch):
     item = item_of(discs_on(a_box(bottom=False)))
-    monkeypatch.setattr("beags_plugin.surfaces.closing_surfels.closing_surfels", lambda solid, like, pixel: like[:0])
+    monkeypatch.setattr("beags_plugin.surfaces.closing_gaussians.gaussians_on", lambda solid, like, pixel: like[:0])
     found, added = with_closing(item, MeshOptions(resolution=48, min_views=1))
     assert str(added) == "nothing to close" and len(found.surfels) == len(item.surfels)
     assert found.invented is not None and not found.invented.any()

@@ -18,7 +18,7 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.rendering import geometry_inputs
-from beags_plugin.surfaces.closing_surfels import joined
+from beags_plugin.surfaces.closing_gaussians import joined
 from beags_plugin.surfaces.contact_faces import ContactFaces, Witnesses, contact_faces
 from beags_plugin.surfaces.fusion import Mesh
 from beags_plugin.surfaces.item import Viewpoints

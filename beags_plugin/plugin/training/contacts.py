@@ -13,7 +13,7 @@ from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.preparation.refiner_training import Edit
 from beags_plugin.rasterizers import make_rasterizer
-from beags_plugin.surfaces.closing_surfels import joined
+from beags_plugin.surfaces.closing_gaussians import joined
 from beags_plugin.surfaces.contact_faces import contact_faces
 from beags_plugin.surfaces.item import Viewpoints
 from beags_plugin.surfaces.mesh_options import MeshOptions

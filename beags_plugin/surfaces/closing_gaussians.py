@@ -67,7 +67,7 @@ def closing_gaussians(item: ExportItem, options: MeshOptions) -> tuple[Surfels, 
         return none, str(error).partition(":")[0]
     assert item.views is not None  # seen_surface raises without views.
     pixel = _pixel(item.views, solid.mesh.vertices)
-    candidates = closing_surfels(solid, item.surfels, pixel)
+    candidates = gaussians_on(solid, item.surfels, pixel)
     more = candidates[_within(candidates, item.surfels, item.views, pixel)]
     return more, "all Gaussians there would leave its outline" if len(candidates) and not len(more) else ""
 
@@ -104,7 +104,7 @@ def _within(more: Surfels, own: Surfels, views: Viewpoints, pixel: float) -> Ten
     return inside
 
 
-def closing_surfels(solid: Closed, like: Surfels, pixel: float) -> Surfels:
+def gaussians_on(solid: Closed, like: Surfels, pixel: float) -> Surfels:
     """Return flat Gaussians on the invented parts of a closed surface, small at its rims and larger inside.
 
     Each has the colour of its place from all directions; higher bands, as many as ``like``, the object, has, are 0.
