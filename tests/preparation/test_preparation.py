@@ -11,6 +11,7 @@ from labelled_views import labelled_views
 from raster_scenes import CLASSES
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import TAU
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import LabelMaps
@@ -21,6 +22,7 @@ from beags_plugin.preparation.consistent_masks import chosen_reprojection
 from beags_plugin.preparation.pipeline import check_options, neighbours, prepare
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import RasterSettings
+from beags_plugin.rasterizers.rendering import SURFACE_DEPTHS
 from beags_plugin.refiners.none import NoRefiner
 from beags_plugin.system.errors import UserError
 
@@ -141,3 +143,9 @@ def test_k_follows_the_training_pixels_where_it_is_stated_for_more():
     assert neighbours(PreparationConfig(k=4, k_pixels=10**9), cameras) == 4
     with pytest.raises(UserError, match="k_pixels is -1"):
         check_options(PreparationConfig(k_pixels=-1))
+
+
+def test_defaults_that_options_repeat_are_those_of_the_stages():
+    """Options import no maths."""
+    config = PreparationConfig()
+    assert (config.tau, config.reprojection) == (TAU, consistent_masks.AUTO) and config.depth in SURFACE_DEPTHS
