@@ -82,15 +82,15 @@ void bind_frame(nb::module_& m, const char* name) {
                               {reinterpret_cast<uint32_t*>(keys.data()), reinterpret_cast<uint32_t*>(sorted.data()),
                                reinterpret_cast<uint32_t*>(low.data())},
                               values.data()};
-        project_surfels(self.view, self.inputs, self.bins, self.visible, scratch, stream_of(stream));
+        project_gaussians(self.view, self.inputs, self.bins, self.visible, scratch, stream_of(stream));
       },
       "temporary"_a, "keys"_a, "sorted"_a, "low"_a.none(), "values"_a, "stream"_a);
   frame.def(
       "bin",
-      [](Frame<T>& self, Ints pair_surfel, Ints keys, Ints pairs, Ints tile_start, Device<uint8_t> temporary,
+      [](Frame<T>& self, Ints pair_gaussian, Ints keys, Ints pairs, Ints tile_start, Device<uint8_t> temporary,
          Ints unsorted_keys, Ints unsorted_pairs, uintptr_t stream) {
-        self.bins.capacity = pair_surfel.shape(0);
-        self.bins.pair_surfel = pair_surfel.data();
+        self.bins.capacity = pair_gaussian.shape(0);
+        self.bins.pair_gaussian = pair_gaussian.data();
         self.bins.keys = reinterpret_cast<uint32_t*>(keys.data());
         self.bins.pairs = pairs.data();
         self.bins.tile_start = tile_start.data();
@@ -98,9 +98,9 @@ void bind_frame(nb::module_& m, const char* name) {
                               static_cast<size_t>(temporary.shape(0)),
                               {reinterpret_cast<uint32_t*>(unsorted_keys.data()), nullptr, nullptr},
                               unsorted_pairs.data()};
-        bin_surfels(self.view, self.inputs.count, self.bins, scratch, stream_of(stream));
+        bin_gaussians(self.view, self.inputs.count, self.bins, scratch, stream_of(stream));
       },
-      "pair_surfel"_a, "keys"_a, "pairs"_a, "tile_start"_a, "temporary"_a, "unsorted_keys"_a, "unsorted_pairs"_a,
+      "pair_gaussian"_a, "keys"_a, "pairs"_a, "tile_start"_a, "temporary"_a, "unsorted_keys"_a, "unsorted_pairs"_a,
       "stream"_a);
   frame.def(
       "forward",
@@ -143,7 +143,7 @@ void bind_frame(nb::module_& m, const char* name) {
         inputs.log_scales = log_scales.data();
         inputs.opacity_logits = opacity_logits.data();
         inputs.colors = colors.data();
-        const SurfelGradients<T> to{
+        const GaussianGradients<T> to{
             g_means.data(),  g_quats.data(),        g_log_scales.data(), g_opacity_logits.data(),
             g_colors.data(), g_screen_shift.data(), sums.data()};
         reduce_records(self.view, inputs, self.bins, records.data(), backward_record<T>(static_cast<Parts>(parts)), to,

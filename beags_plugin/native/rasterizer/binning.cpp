@@ -117,25 +117,25 @@ Bins bin(const View& view, const std::vector<std::vector<Reach>>& reached, std::
     for (const Reach& at : chunk) ++bins.tile_start[at.tile + 1];
   }
   for (size_t tile = 1; tile < bins.tile_start.size(); ++tile) {
-    if (bins.tile_start[tile] > kMostTilePairs) throw std::runtime_error("over 16 million surfels reach one tile");
+    if (bins.tile_start[tile] > kMostTilePairs) throw std::runtime_error("over 16 million Gaussians reach one tile");
     bins.tile_start[tile] += bins.tile_start[tile - 1];
   }
-  if (bins.tile_start.back() > INT32_MAX) throw std::runtime_error("over 2 billion pairs of a tile and a surfel");
+  if (bins.tile_start.back() > INT32_MAX) throw std::runtime_error("over 2 billion pairs of a tile and a Gaussian");
   bins.pairs = Scratch<Pair>(bins.tile_start.back() + kPrefetched);
   std::fill_n(bins.pairs.get() + bins.tile_start.back(), kPrefetched, Pair{});
-  const auto tiles_of = [&](int32_t surfel) {
-    const int64_t chunk = surfel / kChunk;
-    return reached[chunk].data() + (bins.record_start[surfel] - bins.record_start[chunk * kChunk]);
+  const auto tiles_of = [&](int32_t gaussian) {
+    const int64_t chunk = gaussian / kChunk;
+    return reached[chunk].data() + (bins.record_start[gaussian] - bins.record_start[chunk * kChunk]);
   };
   std::vector<int64_t> next(bins.tile_start.begin(), bins.tile_start.end() - 1);
   const size_t ranks = bins.order.size();
   for (size_t rank = 0; rank < ranks; ++rank) {
-    const int32_t surfel = bins.order[rank];
+    const int32_t gaussian = bins.order[rank];
     if (rank + 16 < ranks) __builtin_prefetch(bins.record_start.data() + bins.order[rank + 16]);
     if (rank + 8 < ranks) __builtin_prefetch(tiles_of(bins.order[rank + 8]));
-    const Reach* tiles = tiles_of(surfel);
-    for (int64_t record = bins.record_start[surfel]; record < bins.record_start[surfel + 1]; ++record, ++tiles) {
-      bins.pairs[next[tiles->tile]++] = {surfel, static_cast<int32_t>(record), tiles->mask};
+    const Reach* tiles = tiles_of(gaussian);
+    for (int64_t record = bins.record_start[gaussian]; record < bins.record_start[gaussian + 1]; ++record, ++tiles) {
+      bins.pairs[next[tiles->tile]++] = {gaussian, static_cast<int32_t>(record), tiles->mask};
     }
   }
   return bins;

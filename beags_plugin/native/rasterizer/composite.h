@@ -134,7 +134,7 @@ struct Hits {
 template <bool kPlain, unsigned kNeeds, class T>
 BEAGS_INLINE void evaluate(const Job<T>& job, const Splat<T>& s, int pack, Real<T> dx, Real<T> dy, Mask<T> wanted,
                            Hits<T>& hits) {
-  const auto hit = surfel_hit(s, job.near_plane, dx, dy, wanted, Number<kPlain>{});
+  const auto hit = gaussian_hit(s, job.near_plane, dx, dy, wanted, Number<kPlain>{});
   const int at = hits.count * kLanes<T>;
   store(hits.alpha + at, keep(hit.on, hit.alpha));
   if (kNeeds & kNeedDepth) store(hits.depth + at, keep(hit.on, hit.depth));

@@ -10,20 +10,20 @@ Frame<T>::Frame(const View& view, const Inputs<T>& inputs, bool* visible, int th
     : view_(view),
       tiles_x_(tiles_along(view.width)),
       tiles_y_(tiles_along(view.height)),
-      num_surfels_(inputs.count),
+      num_gaussians_(inputs.count),
       splats_(inputs.count) {
   const int64_t n = inputs.count, chunks = (n + kChunk - 1) / kChunk;
   std::vector<std::vector<Reach>> reached(chunks);
   std::vector<int64_t> record_start(n + 1, 0), nonfinite(chunks, 0);
   const Scratch<T> depths(n);
-  const int team = n < kTeamSurfels ? 1 : threads;
+  const int team = n < kTeamGaussians ? 1 : threads;
   // Determinism: chunks have a fixed size and share nothing.
 #pragma omp parallel for num_threads(team) schedule(dynamic, 1)
   for (int64_t chunk = 0; chunk < chunks; ++chunk) {
     reached[chunk].reserve(4 * kChunk);
     for (int64_t i = chunk * kChunk; i < std::min(n, (chunk + 1) * kChunk); ++i) {
       const size_t before = reached[chunk].size();
-      const Fate fate = place_surfel(view_, inputs, i, splats_[i]);
+      const Fate fate = place_gaussian(view_, inputs, i, splats_[i]);
       nonfinite[chunk] += fate == Fate::kNonFinite;
       visible[i] = fate == Fate::kRendered && find_tiles(view_, splats_[i], reached[chunk]);
       record_start[i + 1] = static_cast<int64_t>(reached[chunk].size() - before);
@@ -114,14 +114,14 @@ void Frame<T>::backward(const Inputs<T>& inputs, const int32_t* target, const Im
 template <class T>
 void Frame<T>::reduce(const Inputs<T>& inputs, const T* records, int size, const InputGradients<T>& to,
                       int threads) const {
-  const auto write = [](T* values, int64_t surfel, const double* numbers, int count) {
-    for (int i = 0; values && i < count; ++i) values[count * surfel + i] = static_cast<T>(numbers[i]);
+  const auto write = [](T* values, int64_t gaussian, const double* numbers, int count) {
+    for (int i = 0; values && i < count; ++i) values[count * gaussian + i] = static_cast<T>(numbers[i]);
   };
   const bool shape = to.means || to.quats || to.log_scales || to.screen_shift;
-  const int team = num_surfels_ < kTeamSurfels ? 1 : threads;
+  const int team = num_gaussians_ < kTeamGaussians ? 1 : threads;
   // Determinism: one thread sums each Gaussian's records, in the order of their tiles.
 #pragma omp parallel for num_threads(team) schedule(dynamic, kChunk)
-  for (int64_t i = 0; i < num_surfels_; ++i) {
+  for (int64_t i = 0; i < num_gaussians_; ++i) {
     double sums[kRecord] = {};
     if (bins_.record_start[i] == bins_.record_start[i + 1]) {
       write(to.colors, i, sums, 3);
@@ -137,11 +137,11 @@ void Frame<T>::reduce(const Inputs<T>& inputs, const T* records, int size, const
     }
     write(to.colors, i, sums + kColor, 3);
     if (size == kColorRecord) continue;
-    const SurfelParameters surfel = parameters(inputs, i);
-    const double g_opacity_logit = sums[kLogOpacity] * surfel.transparency;  // d log sigmoid = 1 - sigmoid
+    const GaussianParameters gaussian = parameters(inputs, i);
+    const double g_opacity_logit = sums[kLogOpacity] * gaussian.transparency;  // d log sigmoid = 1 - sigmoid
     write(to.opacity_logits, i, &g_opacity_logit, 1);
     if (!shape) continue;
-    const ShapeGradients g = project_backward(view_, surfel, sums);
+    const ShapeGradients g = project_backward(view_, gaussian, sums);
     write(to.means, i, g.mean, 3);
     write(to.quats, i, g.quat, 4);
     write(to.log_scales, i, g.log_scale, 2);
@@ -188,10 +188,10 @@ void Frame<T>::feature_channels_backward(const Inputs<T>& inputs, const T* featu
   if (geometry) reduce(inputs, records.get(), size, to, threads);
   if (!g_features) return;
   constexpr int kBlock = 4;
-  const int team = num_surfels_ < kTeamSurfels ? 1 : threads;
+  const int team = num_gaussians_ < kTeamGaussians ? 1 : threads;
   // Determinism: as in `reduce`.
 #pragma omp parallel for num_threads(team) schedule(dynamic, kChunk)
-  for (int64_t i = 0; i < num_surfels_; ++i) {
+  for (int64_t i = 0; i < num_gaussians_; ++i) {
     for (int first = 0; first < count; first += kBlock) {
       double sums[kBlock] = {};
       for (int64_t record = bins_.record_start[i]; record < bins_.record_start[i + 1]; ++record) {

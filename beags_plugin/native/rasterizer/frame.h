@@ -4,16 +4,16 @@
 #include <vector>
 
 #include "rasterizer/binning.h"
+#include "rasterizer/gaussian_inputs.h"
 #include "rasterizer/projection.h"
 #include "rasterizer/scratch.h"
-#include "rasterizer/surfel_inputs.h"
 #include "rasterizer/types.h"
 
 namespace beags {
 
 // Below about 0.3 ms of work, a team of threads costs more than it saves.
-constexpr int64_t kTeamSurfels = 2000;  // projecting one takes a tenth of a microsecond
-constexpr int64_t kTeamPairs = 500;     // rendering one takes most of a microsecond
+constexpr int64_t kTeamGaussians = 2000;  // projecting one takes a tenth of a microsecond
+constexpr int64_t kTeamPairs = 500;       // rendering one takes most of a microsecond
 
 // Null: not wanted. The others are zero on entry, because Gaussians that were not rendered are not written.
 template <class T>
@@ -48,7 +48,7 @@ class Frame {
 
   int64_t num_nonfinite() const { return num_nonfinite_; }
   int64_t num_pairs() const { return bins_.tile_start.back(); }
-  int64_t num_surfels() const { return num_surfels_; }
+  int64_t num_gaussians() const { return num_gaussians_; }
   const View& view() const { return view_; }
 
   // Renders. background: [3]; target: [height, width] or null. keep: for a later `backward`.
@@ -116,7 +116,7 @@ class Frame {
 
   View view_;
   int tiles_x_, tiles_y_;
-  int64_t num_surfels_, num_nonfinite_ = 0;
+  int64_t num_gaussians_, num_nonfinite_ = 0;
   Scratch<Splat<T>> splats_;
   Bins bins_;
   T background_[3] = {};

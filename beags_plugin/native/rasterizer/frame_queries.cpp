@@ -65,10 +65,10 @@ typename Frame<T>::LabelSums Frame<T>::label_sums(const int32_t* labels, int num
 template <class T>
 void Frame<T>::class_contributions(const int32_t* labels, int num_classes, T* out, int threads) const {
   const LabelSums found = label_sums(labels, num_classes, kernels<T>().class_contributions, {}, threads);
-  const int team = num_surfels_ < kTeamSurfels ? 1 : threads;
+  const int team = num_gaussians_ < kTeamGaussians ? 1 : threads;
   // Determinism: one thread sums each Gaussian's records, in the order of their tiles.
 #pragma omp parallel for num_threads(team) schedule(dynamic, kChunk)
-  for (int64_t i = 0; i < num_surfels_; ++i) {
+  for (int64_t i = 0; i < num_gaussians_; ++i) {
     for (int64_t record = bins_.record_start[i]; record < bins_.record_start[i + 1]; ++record) {
       const T* row = found.sums.data() + found.row_of[record];
       for (const int32_t label : found.tile_labels[found.tile_of[record]]) out[i * num_classes + label] += *row++;
@@ -100,9 +100,9 @@ Contributions<T> Frame<T>::sparse_top_contributions(const int32_t* labels, int n
 
 template <class T>
 Contributions<T> Frame<T>::sparse(const LabelSums& found, int num_classes, int threads) const {
-  const int64_t chunks = (num_surfels_ + kChunk - 1) / kChunk;
+  const int64_t chunks = (num_gaussians_ + kChunk - 1) / kChunk;
   std::vector<Contributions<T>> parts(chunks);
-  const int team = num_surfels_ < kTeamSurfels ? 1 : threads;
+  const int team = num_gaussians_ < kTeamGaussians ? 1 : threads;
 #pragma omp parallel num_threads(team)
   {
     std::vector<T> sum_of(num_classes, T(0));
@@ -111,7 +111,7 @@ Contributions<T> Frame<T>::sparse(const LabelSums& found, int num_classes, int t
     // Determinism: as in class_contributions; the parts are joined in the order of the Gaussians.
 #pragma omp for schedule(dynamic, 1)
     for (int64_t chunk = 0; chunk < chunks; ++chunk) {
-      for (int64_t i = chunk * kChunk; i < std::min<int64_t>((chunk + 1) * kChunk, num_surfels_); ++i) {
+      for (int64_t i = chunk * kChunk; i < std::min<int64_t>((chunk + 1) * kChunk, num_gaussians_); ++i) {
         present.clear();
         for (int64_t record = bins_.record_start[i]; record < bins_.record_start[i + 1]; ++record) {
           const T* row = found.sums.data() + found.row_of[record];
@@ -237,7 +237,7 @@ WorkCounts Frame<T>::work_counts(int threads) const {
     counts.lanes += tile.lanes;
     counts.contributing += tile.contributing;
   }
-  for (const int32_t surfel : bins_.order) counts.box_pairs += tiles_of_usual_box(view_, splats_[surfel]);
+  for (const int32_t gaussian : bins_.order) counts.box_pairs += tiles_of_usual_box(view_, splats_[gaussian]);
   return counts;
 }
 

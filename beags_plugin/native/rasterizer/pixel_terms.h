@@ -15,7 +15,7 @@ namespace BEAGS_ISA {
 
 // on: the lanes where it contributes; in other lanes the numbers have no meaning.
 template <class R, class M>
-struct SurfelHit {
+struct GaussianHit {
   M on;
   R alpha, depth, nearness;  // d and k / d of the hit
   R inverse;                 // 1 / q2, and 0 where the low-pass wins over rho3d
@@ -26,7 +26,7 @@ struct SurfelHit {
 // The forward and the backward must agree in every bit: fused operations are explicit, and compilers may make no
 // others.
 template <class T, class R, class M, class Plain>
-BEAGS_HD_INLINE SurfelHit<R, M> surfel_hit(const Splat<T>& s, T near_plane, R dx, R dy, M wanted, Plain plain) {
+BEAGS_HD_INLINE GaussianHit<R, M> gaussian_hit(const Splat<T>& s, T near_plane, R dx, R dy, M wanted, Plain plain) {
   const R q0 = fma(all(s.u_y), dy, all(s.u_x) * dx);  // E2
   const R q1 = fma(all(s.v_y), dy, all(s.v_x) * dx);
   const R q2 = fma(all(s.w_y), dy, fma(all(s.w_x), dx, all(s.w_0)));

@@ -22,7 +22,7 @@ struct View {
   BEAGS_HD double mapping() const { return near_plane / (1 - near_plane / far_plane); }
 };
 
-struct SurfelParameters {
+struct GaussianParameters {
   double mean[3], quat[4], scale[2];
   double log2_opacity, transparency;  // transparency: 1 - opacity
 };
@@ -60,7 +60,7 @@ struct Placement {
   double normal[3], facing;  // facing: +1 or -1, turns the normal towards the camera
 };
 
-BEAGS_HD inline void place(const View& view, const SurfelParameters& s, Placement& at) {
+BEAGS_HD inline void place(const View& view, const GaussianParameters& s, Placement& at) {
   at.inverse_length = 1 / std::sqrt(s.quat[0] * s.quat[0] + dot(s.quat + 1, s.quat + 1));
   for (int i = 0; i < 4; ++i) at.unit[i] = s.quat[i] * at.inverse_length;
   const double w = at.unit[0], x = at.unit[1], y = at.unit[2], z = at.unit[3];
@@ -117,7 +117,7 @@ BEAGS_HD inline bool is_plain(const View& view, const Splat<double>& s) {
 }
 
 // Fills `splat`, except for colour and class, if the Gaussian is rendered.
-BEAGS_HD inline Fate project(const View& view, const SurfelParameters& s, Splat<double>& splat) {
+BEAGS_HD inline Fate project(const View& view, const GaussianParameters& s, Splat<double>& splat) {
   Placement at;
   place(view, s, at);
   if (!usable_quaternion(at.inverse_length)) return Fate::kNonFinite;
@@ -151,7 +151,7 @@ BEAGS_HD inline Fate project(const View& view, const SurfelParameters& s, Splat<
 
 // Returns the gradient of mean, quat, log_scale and screen shift, from that of the splat's fields (`record`: kRecord
 // sums).
-BEAGS_HD inline ShapeGradients project_backward(const View& view, const SurfelParameters& s, const double* record) {
+BEAGS_HD inline ShapeGradients project_backward(const View& view, const GaussianParameters& s, const double* record) {
   Placement at;
   place(view, s, at);
   const double *mu = at.mu, *mv = at.mv;

@@ -230,12 +230,13 @@ __global__ void sum_records_kernel(int64_t count, Bins<T> bins, const T* records
 }
 
 template <class T>
-BEAGS_DEVICE void write(T* values, int64_t surfel, const double* numbers, int count) {
-  for (int i = 0; values && i < count; ++i) values[count * surfel + i] = static_cast<T>(numbers[i]);
+BEAGS_DEVICE void write(T* values, int64_t gaussian, const double* numbers, int count) {
+  for (int i = 0; values && i < count; ++i) values[count * gaussian + i] = static_cast<T>(numbers[i]);
 }
 
 template <class T>
-__global__ void surfel_gradients_kernel(View view, Inputs<T> inputs, Bins<T> bins, int size, SurfelGradients<T> to) {
+__global__ void gaussian_gradients_kernel(View view, Inputs<T> inputs, Bins<T> bins, int size,
+                                          GaussianGradients<T> to) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
   if (i >= inputs.count) return;
   double sums[kRecord] = {};
@@ -244,9 +245,9 @@ __global__ void surfel_gradients_kernel(View view, Inputs<T> inputs, Bins<T> bin
   if (bins.counts[i] && fits(bins)) {
 #pragma unroll
     for (int number = 0; number < kRecord; ++number) sums[number] = number < size ? to.sums[i * kRecord + number] : 0;
-    const SurfelParameters surfel = parameters(inputs, i);
-    g_opacity_logit = sums[kLogOpacity] * surfel.transparency;  // d log sigmoid = 1 - sigmoid
-    if (to.means || to.quats || to.log_scales || to.screen_shift) g = project_backward(view, surfel, sums);
+    const GaussianParameters gaussian = parameters(inputs, i);
+    g_opacity_logit = sums[kLogOpacity] * gaussian.transparency;  // d log sigmoid = 1 - sigmoid
+    if (to.means || to.quats || to.log_scales || to.screen_shift) g = project_backward(view, gaussian, sums);
   }
   write(to.colors, i, sums + kColor, 3);
   write(to.opacity_logits, i, &g_opacity_logit, 1);
@@ -279,12 +280,12 @@ int backward_record(Parts parts) {
 
 template <class T>
 void reduce_records(const View& view, const Inputs<T>& inputs, const Bins<T>& bins, const T* records, int size,
-                    const SurfelGradients<T>& to, Stream stream) {
+                    const GaussianGradients<T>& to, Stream stream) {
   const int64_t n = inputs.count;
   auto sum = sum_records_kernel<kRecord, T>;
   if (size == kShapeRecord) sum = sum_records_kernel<kShapeRecord, T>;
   BEAGS_LAUNCH(sum, blocks_for(n * kWarpThreads), kBlockThreads, stream, n, bins, records, to.sums);
-  const auto finish = surfel_gradients_kernel<T>;
+  const auto finish = gaussian_gradients_kernel<T>;
   BEAGS_LAUNCH(finish, blocks_for(n, 128), 128, stream, view, inputs, bins, size, to);
 }
 
@@ -292,7 +293,7 @@ void reduce_records(const View& view, const Inputs<T>& inputs, const Bins<T>& bi
   template void draw_backward(const TileJob<T>&, Parts, Stream);                             \
   template int backward_record<T>(Parts);                                                    \
   template void reduce_records(const View&, const Inputs<T>&, const Bins<T>&, const T*, int, \
-                               const SurfelGradients<T>&, Stream);
+                               const GaussianGradients<T>&, Stream);
 BEAGS_INSTANTIATE(float)
 BEAGS_INSTANTIATE(double)
 #undef BEAGS_INSTANTIATE

@@ -3,7 +3,7 @@
 #pragma once
 
 #include "cuda/platform.h"
-#include "rasterizer/surfel_inputs.h"
+#include "rasterizer/gaussian_inputs.h"
 #include "rasterizer/types.h"
 
 namespace beags {
@@ -15,16 +15,16 @@ constexpr int kMostTiles = 0xFFFF;  // a pair's key holds the tile above the mas
 // Gaussians, projected and sorted into tiles.
 template <class T>
 struct Bins {
-  Splat<T>* splats;      // [N]
-  int32_t* counts;       // [N] number of tiles that a Gaussian reaches
-  int32_t* order;        // [N] Gaussians by depth, then by index; those that reach no tile come last
-  int64_t* pair_start;   // [N + 1] the pairs of order[r] are pair_start[r] .. pair_start[r + 1] - 1
-  int64_t* totals;       // [2] pairs; Gaussians with numbers that are not finite
-  int64_t capacity;      // number of pairs that the memory holds; with more pairs, the images are wrong
-  int32_t* pair_surfel;  // [capacity]
-  uint32_t* keys;        // [capacity] tile << kMaskBits | mask, ordered by tile, then by depth
-  int32_t* pairs;        // [capacity] in the order of `keys`
-  int32_t* tile_start;   // [tiles + 1] into keys and pairs
+  Splat<T>* splats;        // [N]
+  int32_t* counts;         // [N] number of tiles that a Gaussian reaches
+  int32_t* order;          // [N] Gaussians by depth, then by index; those that reach no tile come last
+  int64_t* pair_start;     // [N + 1] the pairs of order[r] are pair_start[r] .. pair_start[r + 1] - 1
+  int64_t* totals;         // [2] pairs; Gaussians with numbers that are not finite
+  int64_t capacity;        // number of pairs that the memory holds; with more pairs, the images are wrong
+  int32_t* pair_gaussian;  // [capacity]
+  uint32_t* keys;          // [capacity] tile << kMaskBits | mask, ordered by tile, then by depth
+  int32_t* pairs;          // [capacity] in the order of `keys`
+  int32_t* tile_start;     // [tiles + 1] into keys and pairs
 };
 
 // Device memory that is free again when the kernels end.
@@ -38,11 +38,11 @@ struct Scratch {
 // Projects the Gaussians; fills the part of `bins` that does not depend on the capacity. visible: [N], whether a
 // Gaussian is rendered and its box touches the image.
 template <class T>
-void project_surfels(const View& view, const Inputs<T>& inputs, const Bins<T>& bins, bool* visible,
-                     const Scratch& scratch, Stream stream);
+void project_gaussians(const View& view, const Inputs<T>& inputs, const Bins<T>& bins, bool* visible,
+                       const Scratch& scratch, Stream stream);
 // Fills the rest of `bins`.
 template <class T>
-void bin_surfels(const View& view, int64_t count, const Bins<T>& bins, const Scratch& scratch, Stream stream);
+void bin_gaussians(const View& view, int64_t count, const Bins<T>& bins, const Scratch& scratch, Stream stream);
 
 // The forward's results for the backward: [height, width] each; null: not rendered, or no backward.
 template <class T>
@@ -81,13 +81,13 @@ int backward_record(Parts parts);
 
 // Null: not wanted; the others are filled. sums: [N, kRecord] float64.
 template <class T>
-struct SurfelGradients {
+struct GaussianGradients {
   T *means, *quats, *log_scales, *opacity_logits, *colors, *screen_shift;
   double* sums;
 };
 template <class T>
 void reduce_records(const View& view, const Inputs<T>& inputs, const Bins<T>& bins, const T* records, int size,
-                    const SurfelGradients<T>& to, Stream stream);
+                    const GaussianGradients<T>& to, Stream stream);
 
 // The unit of a weight w as a whole number: sums then do not depend on their order.
 constexpr int kWeightBits = 38;

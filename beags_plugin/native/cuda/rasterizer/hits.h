@@ -15,12 +15,12 @@ constexpr int kTileWarps = kTilePixels / kWarpThreads;
 static_assert(kTilePixels == kBlockThreads && kWarpThreads == 2 * kGroupPixels, "a thread is a pixel");
 
 template <class T>
-using Hit = SurfelHit<T, bool>;
+using Hit = GaussianHit<T, bool>;
 
 // Returns zeros where the Gaussian does not contribute.
 template <class T>
 BEAGS_DEVICE Hit<T> evaluate(T near_plane, const Splat<T>& s, T dx, T dy, bool wanted) {
-  Hit<T> hit = surfel_hit(s, near_plane, dx, dy, wanted, s.plain);  // s.plain is the same for the whole warp.
+  Hit<T> hit = gaussian_hit(s, near_plane, dx, dy, wanted, s.plain);  // s.plain is the same for the whole warp.
   if (!hit.on) hit = Hit<T>{};
   return hit;
 }
@@ -38,8 +38,8 @@ BEAGS_DEVICE void load_batch(const Bins<T>& bins, int64_t first, int count, Batc
   constexpr int kWords = sizeof(Splat<T>) / sizeof(uint4);
   static_assert(sizeof(Splat<T>) % sizeof(uint4) == 0, "copied in words of 16 bytes");
   for (int i = threadIdx.x; i < count * kWords; i += kBlockThreads) {
-    const int32_t surfel = bins.pair_surfel[bins.pairs[first + i / kWords]];
-    reinterpret_cast<uint4*>(batch.splats)[i] = reinterpret_cast<const uint4*>(bins.splats + surfel)[i % kWords];
+    const int32_t gaussian = bins.pair_gaussian[bins.pairs[first + i / kWords]];
+    reinterpret_cast<uint4*>(batch.splats)[i] = reinterpret_cast<const uint4*>(bins.splats + gaussian)[i % kWords];
   }
   for (int i = threadIdx.x; i < count; i += kBlockThreads) {
     batch.masks[i] = bins.keys[first + i] & ((1u << kMaskBits) - 1);

@@ -51,7 +51,7 @@ __global__ void project_kernel(View view, Inputs<T> inputs, Bins<T> bins, bool* 
   const int64_t i = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
   if (i >= inputs.count) return;
   Splat<T> splat;
-  const Fate fate = place_surfel(view, inputs, i, splat);
+  const Fate fate = place_gaussian(view, inputs, i, splat);
   int32_t count = 0;
   bool seen = false;
   uint32_t high_key = kLastKey, low_key = kLastKey;
@@ -97,15 +97,15 @@ template <class T>
 __global__ void emit_kernel(View view, int64_t count, Bins<T> bins, uint32_t* keys, int32_t* pairs) {
   const int64_t r = static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x;
   if (r >= count) return;
-  const int32_t surfel = bins.order[r];
-  if (bins.counts[surfel] == 0) return;
+  const int32_t gaussian = bins.order[r];
+  if (bins.counts[gaussian] == 0) return;
   int64_t at = bins.pair_start[r];
-  const Extent extent(view, bins.splats[surfel]);
+  const Extent extent(view, bins.splats[gaussian]);
   for_each_tile(extent, tiles_along(view.width), [&](int tile, unsigned mask) {
     if (at < bins.capacity) {
       keys[at] = static_cast<uint32_t>(tile) << kMaskBits | mask;
       pairs[at] = static_cast<int32_t>(at);
-      bins.pair_surfel[at] = surfel;
+      bins.pair_gaussian[at] = gaussian;
     }
     ++at;
   });
@@ -134,8 +134,8 @@ int bits_for(int values) {  // bits for the numbers below `values`, of which non
 }  // namespace
 
 template <class T>
-void project_surfels(const View& view, const Inputs<T>& inputs, const Bins<T>& bins, bool* visible,
-                     const Scratch& scratch, Stream stream) {
+void project_gaussians(const View& view, const Inputs<T>& inputs, const Bins<T>& bins, bool* visible,
+                       const Scratch& scratch, Stream stream) {
   const int64_t n = inputs.count;
   constexpr bool kTwoKeys = sizeof(T) == 8;
   uint32_t *keys = scratch.keys[0], *sorted = scratch.keys[1], *low = kTwoKeys ? scratch.keys[2] : nullptr;
@@ -160,7 +160,7 @@ void project_surfels(const View& view, const Inputs<T>& inputs, const Bins<T>& b
 }
 
 template <class T>
-void bin_surfels(const View& view, int64_t count, const Bins<T>& bins, const Scratch& scratch, Stream stream) {
+void bin_gaussians(const View& view, int64_t count, const Bins<T>& bins, const Scratch& scratch, Stream stream) {
   const int tiles = tiles_along(view.width) * tiles_along(view.height);
   const size_t bytes = static_cast<size_t>(bins.capacity) * sizeof(uint32_t);
   fill_bytes(scratch.keys[0], 0xFF, bytes, stream);
@@ -177,9 +177,9 @@ void bin_surfels(const View& view, int64_t count, const Bins<T>& bins, const Scr
                bins.keys, bins.tile_start);
 }
 
-#define BEAGS_INSTANTIATE(T)                                                                                   \
-  template void project_surfels(const View&, const Inputs<T>&, const Bins<T>&, bool*, const Scratch&, Stream); \
-  template void bin_surfels(const View&, int64_t, const Bins<T>&, const Scratch&, Stream);
+#define BEAGS_INSTANTIATE(T)                                                                                     \
+  template void project_gaussians(const View&, const Inputs<T>&, const Bins<T>&, bool*, const Scratch&, Stream); \
+  template void bin_gaussians(const View&, int64_t, const Bins<T>&, const Scratch&, Stream);
 BEAGS_INSTANTIATE(float)
 BEAGS_INSTANTIATE(double)
 #undef BEAGS_INSTANTIATE

@@ -24,8 +24,8 @@ __global__ void __launch_bounds__(kTilePixels)
       const int32_t next = __shfl_sync(kWholeWarp, label, __ffs(left) - 1);
       const unsigned long long sum = warp_sum(label == next ? whole : 0ull);
       if (place.lane == 0) {
-        const int64_t surfel = job.bins.pair_surfel[job.bins.pairs[start + k]];
-        atomicAdd(sums + surfel * num_classes + next, sum);
+        const int64_t gaussian = job.bins.pair_gaussian[job.bins.pairs[start + k]];
+        atomicAdd(sums + gaussian * num_classes + next, sum);
       }
       left &= ~__ballot_sync(kWholeWarp, label == next);
     }
@@ -48,7 +48,7 @@ __global__ void __launch_bounds__(kTilePixels)
   __syncthreads();
   const int64_t start = job.bins.tile_start[place.tile], end = job.bins.tile_start[place.tile + 1];
   for (int64_t k = start + threadIdx.x; k < end; k += kTilePixels) {
-    const int32_t id = job.bins.splats[job.bins.pair_surfel[job.bins.pairs[k]]].class_id;
+    const int32_t id = job.bins.splats[job.bins.pair_gaussian[job.bins.pairs[k]]].class_id;
     atomicOr(present + id / 32, uint32_t(1) << id % 32);
   }
   __syncthreads();
@@ -103,7 +103,7 @@ __global__ void __launch_bounds__(kTilePixels) dominant_gaussian_kernel(TileJob<
   });
   if (!place.inside) return;
   const int64_t start = job.bins.tile_start[place.tile];
-  indices[place.at] = pair < 0 ? -1 : job.bins.pair_surfel[job.bins.pairs[start + pair]];
+  indices[place.at] = pair < 0 ? -1 : job.bins.pair_gaussian[job.bins.pairs[start + pair]];
 }
 
 }  // namespace

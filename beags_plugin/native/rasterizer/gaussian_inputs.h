@@ -27,8 +27,8 @@ BEAGS_HD bool all_finite(const T* numbers, int count) {
 
 // Reads Gaussian i; its transcendental functions are computed in T.
 template <class T>
-BEAGS_HD SurfelParameters parameters(const Inputs<T>& inputs, int64_t i) {
-  SurfelParameters s;
+BEAGS_HD GaussianParameters parameters(const Inputs<T>& inputs, int64_t i) {
+  GaussianParameters s;
   for (int axis = 0; axis < 3; ++axis) s.mean[axis] = inputs.means[3 * i + axis];
   for (int axis = 0; axis < 4; ++axis) s.quat[axis] = inputs.quats[4 * i + axis];
   for (int axis = 0; axis < 2; ++axis) s.scale[axis] = std::exp(inputs.log_scales[2 * i + axis]);
@@ -72,7 +72,7 @@ BEAGS_HD bool narrow(const Splat<double>& from, Splat<T>& to) {
 
 // Projects Gaussian i.
 template <class T>
-BEAGS_HD Fate place_surfel(const View& view, const Inputs<T>& inputs, int64_t i, Splat<T>& splat) {
+BEAGS_HD Fate place_gaussian(const View& view, const Inputs<T>& inputs, int64_t i, Splat<T>& splat) {
   if (!all_finite(inputs.means + 3 * i, 3) || !all_finite(inputs.quats + 4 * i, 4) ||
       !all_finite(inputs.log_scales + 2 * i, 2) || !all_finite(inputs.opacity_logits + i, 1) ||
       !all_finite(inputs.colors + 3 * i, 3)) {
