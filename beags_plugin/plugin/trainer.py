@@ -23,7 +23,6 @@ from beags_plugin.plugin.options.machine import check_machine
 from beags_plugin.plugin.options.rollback import Rollback, noted
 from beags_plugin.plugin.training.checkpoints import Checkpoints
 from beags_plugin.plugin.training.memory_guard import NO_MEMORY, MemoryWatch, check_room, is_out_of_memory
-from beags_plugin.plugin.training.monitor import HeldOutCurve
 from beags_plugin.plugin.training.optimizers import SceneOptimizer
 from beags_plugin.plugin.training.resumable import GlobalRandom, Resumable
 from beags_plugin.plugin.training.scene_model import SceneModel
@@ -53,7 +52,6 @@ class BeagsTrainer(Trainer):
         self.config = config
         self._steps_option = config.max_num_iterations
         self.reschedule(self.schedule)
-        self.curve: HeldOutCurve | None = None
         self.seconds = StageSeconds()
         self._interrupts = Interrupts(self._go_on)
         self._lock: BaseFileLock | None = None
@@ -199,12 +197,6 @@ class BeagsTrainer(Trainer):
         )
         remove_unfinished(self.base_dir)
         (self.base_dir / REPORT_FILE).unlink(missing_ok=True)  # It marks a run as complete.
-        if self.config.steps_per_held_out > 0:
-            datamanager = cast(BeagsDataManager, self.pipeline.datamanager)
-            self.curve = HeldOutCurve(
-                self.base_dir, self.config.steps_per_held_out, self.last_step, self._model, datamanager
-            )
-            self.keep("held_out", self.curve)
         self.keep("random", GlobalRandom())
         self._checkpoints.drop_loaded_states()
         try:
@@ -217,13 +209,10 @@ class BeagsTrainer(Trainer):
             raise SystemExit(self._interrupts.exit_code) from interrupt
 
     def train_iteration(self, step: int) -> Any:
-        """Train one step; after some of them, print how long the run will take, or measure the held-out views."""
+        """Train one step; after some of them, print how long the run will take."""
         self._estimate.before_step(step - self._start_step)
         result = super().train_iteration(step)
         self._done = step
-        if self.curve is not None:
-            self.curve.after_step(step)  # A scene that has just grown would need some steps to recover.
-            self._model.clock.skip()
         return result
 
     # -- checkpoints -------------------------------------------------------------------------------------------------

@@ -12,9 +12,9 @@ again, the same is begun in a folder of its own, killed, and done again or resum
 - export: ``beags export`` of all objects, splats and meshes, at a random moment;
 - exported file: the same, while it writes a random one of its files. After both, what lies in its folder must be whole.
 
-Compared are the checkpoints with the optimizers' state, the base, the curve of held-out quality, the masks, the voxel
-grids, the exported files. Random moments are counted in CPU time, so that a busy machine changes nothing (Linux). All
-are forks of this process, which imports everything once. Exit status 1: something differed.
+Compared are the checkpoints with the optimizers' state, the base, the masks, the voxel grids, the exported files.
+Random moments are counted in CPU time, so that a busy machine changes nothing (Linux). All are forks of this process,
+which imports everything once. Exit status 1: something differed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ OPTIONS = {
     "pipeline.model.base_steps": 80, "pipeline.model.refine_steps": 30,
     "pipeline.model.densify.start": 20, "pipeline.model.densify.stop": 70, "pipeline.model.densify.every": 20,
     "pipeline.model.densify.max_surfels": 2500, "pipeline.model.prepare.k": 200, "steps_per_save": 5,
-    "steps_per_held_out": 40, "vis": "tensorboard",
+    "vis": "tensorboard",
 }  # fmt: skip
 FORMATS = ("ply", "ply-2dgs", "compressed-ply", "sog", "spz", "html", "glb", "obj", "stl", "3mf")  # usdz needs an extra
 EXPORT = ("--all", "--format", *FORMATS, "--scale-by", "0,0,0 1,0,0 1 m", "--resolution", "32", "--min-views", "1")

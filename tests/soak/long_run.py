@@ -3,8 +3,8 @@
     python tests/soak/long_run.py --json long_run.json --picture long_run.png
 
 Trains beags-tiny with 2,000 refinement steps on a small generated sample, in a process of its own (Linux), with the
-curves, checkpoints and held-out measurements of the preset. Asked at regular steps is what the process holds: resident
-memory, threads, open files, child processes. Exit status 1 if
+curves and checkpoints of the preset. Asked at regular steps is what the process holds: resident memory, threads, open
+files, child processes. Exit status 1 if
 
 - memory grows over the second half of refinement by more than ``NOISE_MB`` (the line through all values there, by the
   median of the slopes between any two of them),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,10 @@ CLOCKS = ("seconds", "cpu_seconds", "clocks")
 
 
 def run_differences(whole: Path, run: Path) -> list[str]:
-    """Return what differs between two complete runs: checkpoints and their content, base, curve, masks and grids."""
+    """Return what differs between two complete runs: checkpoints and their content, base, masks and grids."""
     found = []
     for pattern in ("nerfstudio_models/*.ckpt", "base/nerfstudio_models/*.ckpt", "prepared/**/grid.pt"):
         found += _name_by_name(whole, run, pattern, _tensor_differences)
-    found += _name_by_name(whole, run, "held_out.json", _json_differences)
     found += _name_by_name(whole, run, "prepared/**/*.png", _byte_differences)
     return found + unfinished(run)
 
@@ -53,10 +51,6 @@ def _byte_differences(one: Path, other: Path) -> list[str]:
 
 def _tensor_differences(one: Path, other: Path) -> list[str]:
     return compare(*(_without_clocks(torch.load(path, weights_only=True)) for path in (one, other)), "")
-
-
-def _json_differences(one: Path, other: Path) -> list[str]:
-    return compare(*(_without_clocks(json.loads(path.read_text())) for path in (one, other)), "")
 
 
 def _without_clocks(value: Any) -> Any:

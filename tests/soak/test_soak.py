@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import sys
 from itertools import islice
@@ -57,7 +56,6 @@ def write_run(folder: Path, value: float = 1.0, seconds: float = 3.0) -> Path:
     (folder / "prepared/masks").mkdir(parents=True)
     torch.save({"keys": torch.arange(3)}, folder / "prepared/grid.pt")
     (folder / "prepared/masks/a.png").write_bytes(b"picture")
-    (folder / "held_out.json").write_text(json.dumps([{"psnr": value, "seconds": seconds}]))
     return folder
 
 
@@ -65,11 +63,11 @@ def test_runs_are_the_same_but_for_clocks(tmp_path):
     one = write_run(tmp_path / "one")
     assert same_bits.run_differences(one, write_run(tmp_path / "other", seconds=4.0)) == []
     found = same_bits.run_differences(one, write_run(tmp_path / "third", value=1.0000001))
-    assert [name.split("/")[-1] for name in found] == ["0", "0", "psnr"]  # two tensors and the curve
-    (tmp_path / "other/held_out.json").unlink()
+    assert [name.split("/")[-1] for name in found] == ["0", "0"]  # two tensors
+    (tmp_path / "other/prepared/masks/a.png").unlink()
     (tmp_path / "other/.b.part").touch()
     found = same_bits.run_differences(one, tmp_path / "other")
-    assert f"left behind: {tmp_path}/other/.b.part" in found and "only in one: held_out.json" in found
+    assert f"left behind: {tmp_path}/other/.b.part" in found and "only in one: prepared/masks/a.png" in found
 
 
 @pytest.mark.parametrize("share, part", [(0.5, 500), (1.1, 1000)])
@@ -85,8 +83,8 @@ def test_a_process_ends_in_the_write_that_is_chosen(tmp_path, share, part):
 
 
 def test_a_training_leaves_nothing_behind(tmp_path):
-    """Train 150 steps, with curves, checkpoints, pictures and held-out measurements among them."""
-    options = ("--steps-per-save", "40", "--steps-per-eval-image", "30", "--steps-per-held-out", "50")
+    """Train 150 steps, with curves, checkpoints and pictures among them."""
+    options = ("--steps-per-save", "40", "--steps-per-eval-image", "30")
     record = long_run.trained(tmp_path, 60, 90, 5, *options)
     _, failures = long_run.judged(record)
     # The run is too short to say how memory goes on.

@@ -78,9 +78,6 @@ class BeagsTrainerConfig(TrainerConfig):
     """Replace the run in the folder; without this option, a folder that holds a checkpoint is refused."""
     max_num_iterations: int = 0
     """Step of the schedule to stop after; 0 runs base_steps + refine_steps."""
-    steps_per_held_out: int = 0
-    """Steps between two measurements of all held-out views, written to held_out.json of the run; 0: never."""
-
     check_memory: bool = True
     """Refuse to begin if hardly any memory or disk is free; save and stop when memory runs out (on a CPU)."""
 

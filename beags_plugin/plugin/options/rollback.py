@@ -11,7 +11,7 @@ from beags_plugin.system.lock import LOCK
 REPLACED = "replaced_models"
 """Folder in a run for the checkpoints of an earlier run, until the new one has its own."""
 _MODELS = "nerfstudio_models"
-_REWRITTEN = ("config.yml", "training.json", "dataparser_transforms.json", "start.json", "held_out.json")
+_REWRITTEN = ("config.yml", "training.json", "dataparser_transforms.json", "start.json")
 _ADDED = (LOCK, "events.out.tfevents.*", "prepared", "base", "wandb")
 """Files that a training adds before its first checkpoint; other programs may write into the folder too."""
 

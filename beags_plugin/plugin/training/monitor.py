@@ -1,11 +1,8 @@
-"""Measure a run while it trains: curves for tensorboard and wandb, and the quality of held-out views."""
+"""Measure a run while it trains: curves for tensorboard and wandb."""
 
 from __future__ import annotations
 
-import json
-import time
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,23 +15,17 @@ from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import mask_metrics
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView
-from beags_plugin.evaluation.run_metrics import MaskRenderer, psnr_after_fit
+from beags_plugin.evaluation.run_metrics import MaskRenderer
 from beags_plugin.evaluation.violations import boundary_errors, occupancy_violations
 from beags_plugin.labels.class_ids import BACKGROUND
 from beags_plugin.labels.colors import colorize
-from beags_plugin.losses.photometric import psnr, ssim
 from beags_plugin.plugin.training.scene_model import SceneModel, picture
-from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.rasterizers.rendering import render_class_map, surfel_inputs
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.memory import memory_mb, peak_memory_mb
-from beags_plugin.system.progress import counted, progress_bar, say
-from beags_plugin.system.whole_files import write_text_atomically
-from beags_plugin.views.views import View
+from beags_plugin.system.progress import progress_bar, say
 
 MOST_CLASSES = 20  # Classes, the first by id, with a curve and a picture each.
-CURVE = "held_out.json"
-"""File of a run: one record per measurement, see ``HeldOutCurve``."""
 VIEWS = 4  # Evenly spaced held-out views on which masks are measured.
 
 
@@ -159,67 +150,3 @@ class Curves:
             if len(part):
                 image = picture(model, surfel_inputs(part, camera), camera)
                 writer.put_image(f"Objects/{model.classes[index]}", image, step)
-
-
-class HeldOutCurve:
-    """Quality against steps, written to ``<run>/held_out.json``.
-
-    A record holds ``step`` (steps done), ``gaussians``, the means ``psnr`` (dB) and ``ssim`` of the held-out views,
-    ``train_psnr`` of as many evenly spaced training views, and ``seconds`` and ``cpu_seconds`` of training so far,
-    without the measurements. A scene with exposures also has ``psnr_fit`` and ``train_psnr_fit``, after the affine
-    colour fit of each view. Only colours are rendered, so a view costs a fraction of a step.
-    """
-
-    def __init__(self, folder: Path, every: int, last: int, model: SceneModel, datamanager: BeagsDataManager) -> None:
-        self.file = folder / CURVE
-        self.every = every
-        self.ends = {model.schedule.base_steps, last}
-        self.model = model
-        self.held_out = datamanager.views("eval")
-        train = datamanager.views("train")
-        count = min(len(self.held_out), len(train))
-        self.train = [train[index * len(train) // count] for index in range(count)]
-        self.records: list[dict[str, float]] = []
-        self._started = _clocks()
-
-    def state(self) -> dict[str, Any]:
-        """Return the curve so far, and the clocks; see ``resumable.Resumable``."""
-        now = _clocks()
-        return {"records": list(self.records), "clocks": {name: now[name] - self._started[name] for name in now}}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continue from ``state``."""
-        self.records = list(state["records"])
-        self._started = {name: now - state["clocks"][name] for name, now in _clocks().items()}
-
-    def after_step(self, step: int) -> None:
-        """Measure at every multiple of ``every`` steps, and where a phase ends."""
-        done = step + 1
-        if done % self.every == 0 or done in self.ends:
-            began = _clocks()
-            used = {name: began[name] - self._started[name] for name in began}
-            self.records.append({**self._measure(done), **used})
-            write_text_atomically(json.dumps(self.records, indent=1), self.file)
-            self._started = {name: self._started[name] + now - began[name] for name, now in _clocks().items()}
-
-    def _measure(self, done: int) -> dict[str, float]:
-        views = [*self.held_out, *self.train]
-        with progress_bar("Measuring held-out views", passing=True) as progress:
-            qualities = [self._quality(view) for view in counted(views, len(views), progress)]
-        held_out, train = qualities[: len(self.held_out)], qualities[len(self.held_out) :]
-        means = {name: sum(each[name] for each in held_out) / len(held_out) for name in held_out[0]}
-        for name in means.keys() - {"ssim"}:
-            means[f"train_{name}"] = sum(each[name] for each in train) / len(train)
-        return {"step": done, "gaussians": self.model.num_points, **dict(sorted(means.items()))}
-
-    @torch.no_grad()
-    def _quality(self, view: View) -> dict[str, float]:
-        model = self.model
-        image = view.image_on(model.background_color.to(model.device))
-        color = picture(model, surfel_inputs(model.surfels(), view.camera, model.active_sh_degree()), view.camera)
-        quality = {"psnr": float(psnr(color, image)), "ssim": float(ssim(color, image))}
-        return quality if model.exposures is None else {**quality, "psnr_fit": psnr_after_fit(color, image)}
-
-
-def _clocks() -> dict[str, float]:
-    return {"seconds": time.perf_counter(), "cpu_seconds": time.process_time()}
