@@ -152,8 +152,6 @@ class Make:
     """Folder for masks/, classes.json and made.png; the scene's own if left out."""
     overwrite: bool = False
     """Replace masks that are there already."""
-    snap: int = 0
-    """Move boundaries to edges of the photo, by at most this many pixels; 0 leaves them."""
     upright: bool = False
     """The source's masks belong to upright photos: turn them to match the stored photos (EXIF orientation)."""
     layout: str = "auto"
@@ -162,8 +160,6 @@ class Make:
     """Folder of the images, if not the layout's own."""
 
     def run(self) -> None:
-        if self.snap < 0:
-            raise UserError(f"snap is {self.snap}: give a radius in pixels, or 0.")
         with starting(self):
             from beags_plugin.objects.check_masks import data_options
             from beags_plugin.objects.make_masks import configured_source, make_masks
@@ -171,47 +167,7 @@ class Make:
         source = configured_source(self.source, self.options)
         data = data_options(self.data, self.layout, self.images_path)
         run = None if self.load_config is None else Run(self.load_config, self.data)
-        for line in make_masks(data, source, run, self.output, self.overwrite, self.snap, self.upright):
-            CONSOLE.print(line)
-
-
-@dataclass
-class Truth:
-    """Take downloaded masks of a scene of LLFF as ground truth for beags eval; scribbles become prompts for masks."""
-
-    data: Path
-    """Folder of the scene; its name is the scene's, else give --scene."""
-    nvos: Path | None = None
-    """NVOS's folder, of masks, scribbles and reference_image."""
-    spin_nerf: Path | None = None
-    """The folder of SPIn-NeRF's masks, <scene>/<photo>.png."""
-    scene: str | None = None
-    """The scene's name in the download, if it is not the folder's."""
-    object: str | None = None
-    """Name of SPIn-NeRF's object in classes.json; the scene's name if left out."""
-    overwrite: bool = False
-    """Replace masks and prompts that are there already."""
-    layout: str = "auto"
-    """How the data set lays out its files (docs/data.md); auto recognises it."""
-    images_path: Path | None = None
-    """Folder of the images, if not the layout's own."""
-
-    def run(self) -> None:
-        if (self.nvos is None) == (self.spin_nerf is None):
-            raise UserError("give one of --nvos and --spin-nerf the folder of the downloaded masks.")
-        if self.object is not None and self.spin_nerf is None:
-            raise UserError("NVOS names its objects: leave --object out, and call them so in classes.json.")
-        with starting(self):
-            from beags_plugin.data.downloads import read_nvos, read_spin_nerf
-            from beags_plugin.objects.check_masks import data_options
-            from beags_plugin.objects.import_truth import import_truth
-        scene = self.scene or self.data.resolve().name.lower()
-        if self.nvos is not None:
-            objects = read_nvos(self.nvos, scene)
-        else:
-            assert self.spin_nerf is not None
-            objects = read_spin_nerf(self.spin_nerf, scene, self.object or scene)
-        for line in import_truth(data_options(self.data, self.layout, self.images_path), objects, self.overwrite):
+        for line in make_masks(data, source, run, self.output, self.overwrite, self.upright):
             CONSOLE.print(line)
 
 
@@ -229,7 +185,7 @@ class Weights:
 class Masks:
     """Check the masks of a scene, make them consistent, or make them in the first place."""
 
-    action: Agree | Check | Make | Reproject | Truth | Weights
+    action: Agree | Check | Make | Reproject | Weights
 
     def run(self) -> None:
         self.action.run()

@@ -19,7 +19,6 @@ from beags_plugin.data.files import image_size, list_photos, photo_names
 from beags_plugin.data.layout import fitting_layouts
 from beags_plugin.data.orientation import as_stored
 from beags_plugin.labels.classes import NO_TRUTH, check_names, read_id_mask, write_mask
-from beags_plugin.masks.snapping import snap_to_edges
 from beags_plugin.masks.sources import MASK_SOURCES
 from beags_plugin.masks.sources.base import MaskSource, NothingFound, Photo, SourceScene
 from beags_plugin.objects.check_masks import check, options_beside, write_contradictions
@@ -108,17 +107,15 @@ def make_masks(
     run: Run | None = None,
     output: Path | None = None,
     overwrite: bool = False,
-    snap: int = 0,
     upright: bool = False,
 ) -> list[str]:
     """Write the masks of a scene: <output>/masks/<stem>.png, classes.json and made.png, a picture of them.
 
     The files replace the old masks of all views once all are made. data: names the scene. run: a run
     trained on it, for sources that need one. output: if None the scene's own folder, where ``beags-data`` looks for
-    masks. overwrite: replace existing masks. snap: radius in pixels of ``masks.snapping.snap_to_edges``; 0 leaves
-    outlines unchanged. upright: the source makes masks of the upright photos; they are turned to the photos as stored.
-    Returns lines that report the written files and the findings of ``beags masks check``. Raises ``UserError``, before
-    anything is written, for bad input.
+    masks. overwrite: replace existing masks. upright: the source makes masks of the upright photos; they are turned to
+    the photos as stored. Returns lines that report the written files and the findings of ``beags masks check``. Raises
+    ``UserError``, before anything is written, for bad input.
     """
     root, images, trained, posed = _photos(data, source)
     folder = output or root
@@ -158,8 +155,6 @@ def make_masks(
         for index, (path, labels) in enumerate(zip(mask_paths(images), made.maps, strict=True)):
             if labels is None:
                 continue
-            if snap:
-                labels = snap_to_edges(labels, photos[index].pixels(), snap)
             labels = as_stored(labels, photos[index].turned)
             file = unfinished / path
             file.parent.mkdir(parents=True, exist_ok=True)

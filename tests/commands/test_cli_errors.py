@@ -49,14 +49,12 @@ SENTENCES = {
     "view {tmp}/absent.yml": NO_FILE,
     # masks
     "masks agree --load-config {tmp}/absent.yml": NO_FILE,
-    "masks truth --data {tmp}/lab": "give one of --nvos and --spin-nerf the folder of the downloaded masks.",
     "masks check": "no scene is named: give --data its folder, or --load-config a run trained on it.",
     "masks check --data {tmp}/nowhere": NO_DATA,
     "masks check --load-config {tmp}/absent.yml": NO_FILE,
     "masks make --data {tmp}/nowhere --source cut": NO_DATA,
     "masks make --data {tmp}/lab --source magic": "there is no mask source 'magic': choose one of coco, cut, "
     "gaussian-grouping, id-images, object-images, rembg, salient, sam2.",
-    "masks make --data {tmp}/lab --source cut --snap -1": "snap is -1: give a radius in pixels, or 0.",
     "masks make --data {tmp}/lab --source id-images": "{tmp}/lab has masks or a classes.json already "
     "(classes.json): add --overwrite, or give another --output.",
     "masks make --data {tmp}/lab --source id-images --options colour=red": "there is no option 'colour' of the mask "
@@ -122,6 +120,7 @@ SENTENCES = {
     "bench file ablatoin --output {tmp}/bench": "there is no experiment 'ablatoin' (did you mean ablation?): "
     "choose one of ablation, classes, compare, compare-consistent, masks, presets, "
     "sensitivity, or name a .toml file.",
+    "bench truth --data {tmp}/lab": "give one of --nvos and --spin-nerf the folder of the downloaded masks.",
     # doctor
     "doctor --json {tmp}/file/x.json": "{tmp}/file/x.json cannot be written (File exists): choose another place.",
 }

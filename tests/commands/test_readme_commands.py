@@ -71,7 +71,6 @@ ELSEWHERE = {
     "beags bench NAME": "trains for minutes; test_bench_running.py runs experiments to their tables",
     "beags masks weights": "fetches a file; test_salient_source.py runs it",
     "beags masks agree --load-config C": "test_mask_commands.py runs it",
-    "beags masks truth --data X": "needs downloaded masks; test_downloads.py runs it",
     "make demo": "beags demo is run; what make calls is looked at below",
     "make demo DATA=walk.mp4": "the same",
     "make test": "runs these tests",

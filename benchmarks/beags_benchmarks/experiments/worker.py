@@ -129,7 +129,7 @@ def train_trial(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
     from beags_plugin.refiners import make_refiner
     from beags_plugin.runs.checkpoint_file import read_checkpoint
     from beags_plugin.runs.layout import REPORT_FILE, newest_checkpoint
-    from beags_plugin.runs.prepared import grid_state
+    from beags_plugin.runs.prepared import read_grid
     from beags_plugin.system.memory import peak_memory_mb
 
     start_memory_mb = peak_memory_mb()
@@ -154,8 +154,8 @@ def train_trial(request: dict[str, Any], run_folder: Path) -> dict[str, Any]:
     del result["seconds"]["base training"]  # this is the time of loading one
     prepared = run_folder / "prepared"
     result["summary"] = json.loads((prepared / "report.json").read_text())["summary"]
-    grid = grid_state(prepared / "grid.pt")
-    result["voxel_size"] = float(grid["voxel_size"]) if grid else None
+    grid = read_grid(prepared / "grid.pt")
+    result["voxel_size"] = None if grid is None else float(grid.voxel_size)
     sizes = [image_size(path) for path in (prepared / "masks").rglob("*.png")]
     result["training_pixels"] = sum(width * height for width, height in sizes)
     return result

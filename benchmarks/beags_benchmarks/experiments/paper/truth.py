@@ -1,4 +1,4 @@
-"""``beags masks truth``: write downloaded masks of a scene where evaluation finds them."""
+"""``beags bench truth``: write downloaded masks of a scene where evaluation finds them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from beags_benchmarks.experiments.paper.downloads import DownloadedObject, Scribbles
 from beags_plugin.data.dataset import ColmapModel
-from beags_plugin.data.downloads import DownloadedObject, Scribbles
 from beags_plugin.data.files import image_size, same_proportions
 from beags_plugin.data.layouts.llff import camera_names
 from beags_plugin.labels.class_ids import IGNORE

@@ -14,8 +14,8 @@ from data_folders import HEIGHT, WIDTH, noise, write_image
 from layout_folders import ids, write_llff
 from parsed_views import parse
 
+from beags_benchmarks.experiments.paper.downloads import POINTS, points_of, read_nvos
 from beags_plugin.commands import cli
-from beags_plugin.data.downloads import POINTS, points_of, read_nvos
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import read_binary_mask, read_object_mask
 from beags_plugin.masks.sources.prompts import read_prompts
@@ -58,7 +58,7 @@ def nvos(tmp_path):
 
 
 def truth(*words: object) -> None:
-    cli.main(["masks", "truth", *map(str, words)])
+    cli.main(["bench", "truth", *map(str, words)])
 
 
 def refused(capsys, *words: object) -> str:
