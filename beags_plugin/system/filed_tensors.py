@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import errno
-import os
 import tempfile
 import weakref
-import zipfile
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from pathlib import Path
+from threading import Lock
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -17,53 +15,41 @@ import torch
 from torch import Tensor
 
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.arrays import check_members, read_member
 
 
 class FiledTensors(Sequence[Tensor]):
-    """The tensors of a file that ``write_tensors`` wrote, in their order; each access reads the file.
+    """Tensors in an open file, which is closed with this object; each access reads the file.
 
-    source: its path, or the file open for reading, which is closed with this object.
-    device: where the tensors are put.
-    Raises ``OSError`` or ``ValueError`` for a file that is not there or not whole.
+    starts: the place of each tensor in the file, as ``write_tensors`` returns them. device: where they are put.
     """
 
-    def __init__(self, source: Path | BinaryIO, device: torch.device | str = "cpu") -> None:
-        if not isinstance(source, Path):
-            weakref.finalize(self, source.close)
-        try:
-            self._archive = zipfile.ZipFile(source)  # reads the list of members only
-            size = source.stat().st_size if isinstance(source, Path) else os.fstat(source.fileno()).st_size
-            check_members(self._archive, size)
-            self._count = len(self._archive.namelist())
-        except (zipfile.BadZipFile, NotImplementedError) as error:
-            raise ValueError(f"{source} holds no tensors: {error}") from None
-        weakref.finalize(self, self._archive.close)
+    def __init__(self, file: BinaryIO, starts: Sequence[int], device: torch.device | str = "cpu") -> None:
+        weakref.finalize(self, file.close)
+        self._file, self._starts, self._lock = file, starts, Lock()
         self.device = torch.device(device)
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._starts)
 
     def __getitem__(self, index: int | slice) -> Any:
         """Read one tensor, or for a slice a list."""
-        chosen = range(self._count)[index]
+        chosen = self._starts[index]
         return self._read(chosen) if isinstance(chosen, int) else [self._read(each) for each in chosen]
 
-    def _read(self, index: int) -> Tensor:
-        try:
-            return torch.from_numpy(read_member(self._archive, self._archive.getinfo(f"{index}.npy"))).to(self.device)
-        # zipfile raises these for damaged members, torch for types of numbers that it does not know
-        except (zipfile.BadZipFile, NotImplementedError, RuntimeError, KeyError, TypeError, EOFError) as error:
-            raise ValueError(f"tensor {index} cannot be read: {error}") from None
+    def _read(self, start: int) -> Tensor:
+        with self._lock:
+            self._file.seek(start)
+            array = np.lib.format.read_array(self._file, allow_pickle=False)
+        return torch.from_numpy(array).to(self.device)
 
 
-def write_tensors(file: BinaryIO, tensors: Iterable[Tensor]) -> None:
-    """Write tensors one by one, as they come, as an uncompressed .npz whose arrays are named 0, 1, 2, .."""
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for index, values in enumerate(tensors):
-            array = values.detach().cpu().contiguous().numpy()
-            with archive.open(f"{index}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, array, allow_pickle=False)
+def write_tensors(file: BinaryIO, tensors: Iterable[Tensor]) -> list[int]:
+    """Write tensors one by one, as they come; return where each begins."""
+    starts = []
+    for values in tensors:
+        starts.append(file.tell())
+        np.lib.format.write_array(file, values.detach().cpu().contiguous().numpy(), allow_pickle=False)
+    return starts
 
 
 def filed(tensors: Iterable[Tensor], device: torch.device | str = "cpu") -> FiledTensors:
@@ -73,7 +59,7 @@ def filed(tensors: Iterable[Tensor], device: torch.device | str = "cpu") -> File
     """
     file = tempfile.TemporaryFile(prefix="beags-")  # noqa: SIM115  (closed with the result)
     try:
-        write_tensors(file, tensors)
+        starts = write_tensors(file, tensors)
         file.flush()
     except OSError as error:
         with suppress(OSError):  # closing writes the rest of the buffer, which fails again
@@ -82,5 +68,4 @@ def filed(tensors: Iterable[Tensor], device: torch.device | str = "cpu") -> File
             raise
         folder = tempfile.gettempdir()
         raise UserError(f"{folder} is full: free some space there, or name another folder with TMPDIR.") from None
-    file.seek(0)
-    return FiledTensors(file, device)
+    return FiledTensors(file, starts, device)

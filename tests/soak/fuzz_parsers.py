@@ -35,7 +35,7 @@ sys.path[:0] = [str(ROOT), str(Path(__file__).resolve().parent)]
 NAMES = (
     "ply", "seed points", "npy poses", "npz cameras", "npz member", "colmap images", "colmap cameras", "colmap points",
     "transforms.json", "classes.json", "coco", "prompts", "experiment", "run config", "checkpoint", "checkpoint pickle",
-    "voxel grid", "filed tensors", "mask", "mask rows",
+    "voxel grid", "mask", "mask rows",
 )  # fmt: skip
 SECONDS = 20  # seconds of CPU time for one file
 STUCK = 600  # seconds of wall time after which atheris takes a parser to be stuck

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import struct
@@ -26,7 +25,6 @@ from beags_plugin.plugin.options.config import config_text
 from beags_plugin.plugin.options.saved_config import load_run_config
 from beags_plugin.runs import run_config
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.filed_tensors import FiledTensors, write_tensors
 from beags_plugin.system.reading.arrays import load_array, load_arrays
 from beags_plugin.system.reading.images import read_image
 from beags_plugin.system.reading.tensors import load_tensors
@@ -259,18 +257,6 @@ def test_an_archive_whose_list_is_a_lie_is_refused(tmp_path):
     (tmp_path / "a.npz").write_bytes(content[:at] + struct.pack("<I", 0xFFFFFFF0) + content[at + 4 :])
     with pytest.raises(ValueError, match="longer than the file"):
         load_arrays(tmp_path / "a.npz")
-
-
-def test_filed_tensors_are_checked(tmp_path):
-    file = io.BytesIO()
-    write_tensors(file, [torch.arange(3), torch.ones(2, 2)])
-    (tmp_path / "a.npz").write_bytes(file.getvalue())
-    assert FiledTensors(tmp_path / "a.npz")[0].tolist() == [0, 1, 2]
-    content = bytearray(file.getvalue())
-    content[content.index(b"(3,)") + 1 : content.index(b"(3,)") + 2] = b"9"
-    (tmp_path / "a.npz").write_bytes(content)
-    with pytest.raises(ValueError):
-        FiledTensors(tmp_path / "a.npz")[0]
 
 
 # -- pictures and text ------------------------------------------------------------------------------------------

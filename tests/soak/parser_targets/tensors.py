@@ -1,4 +1,4 @@
-"""Parsers of what a run leaves: checkpoints, grids, filed tensors."""
+"""Parsers of what a run leaves: checkpoints and grids."""
 
 from __future__ import annotations
 
@@ -32,15 +32,6 @@ def _grid(path: Path) -> None:
     from beags_plugin.runs.prepared import read_grid
 
     read_grid(path)
-
-
-def _filed(path: Path) -> None:
-    from beags_plugin.system.filed_tensors import FiledTensors
-
-    try:
-        list(FiledTensors(path))
-    except (OSError, ValueError, EOFError):  # a file that is damaged
-        return
 
 
 def _saved(content: Any) -> bytes:
@@ -91,19 +82,10 @@ def _grid_files() -> list[bytes]:
     return [_saved(state), _saved({})]
 
 
-def _filed_files() -> list[bytes]:
-    from beags_plugin.system.filed_tensors import write_tensors
-
-    file = io.BytesIO()
-    write_tensors(file, [torch.ones(2, 2), torch.arange(3)])
-    return [file.getvalue()]
-
-
 TARGETS = {
     "checkpoint": Target("step-000000003.ckpt", _checkpoint, lambda: [_saved(_checkpoint_content())]),
     "checkpoint pickle": Target(
         "step-000000003.ckpt", _checkpoint, lambda: [_pickle_of(_checkpoint_content())], _with_pickle
     ),
     "voxel grid": Target("grid.pt", _grid, _grid_files),
-    "filed tensors": Target("a.npz", _filed, _filed_files),
 }
