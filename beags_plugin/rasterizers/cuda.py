@@ -3,8 +3,7 @@
 All memory is torch's, all kernels run on torch's current stream. Only the GPU knows the number of pairs (a tile and a
 surfel that reaches it), so their memory is guessed from earlier renders, and all kernels of a render are launched on
 that guess. Then the host waits for the number, which the GPU has long before the image, and launches the last kernels
-again in the rare case that the guess was too small. The GPU never waits for the host. In a CUDA graph the host does not
-wait either: there, such a render has no gradients.
+again in the rare case that the guess was too small. The GPU never waits for the host.
 """
 
 from __future__ import annotations
@@ -37,8 +36,6 @@ from beags_plugin.system.errors import UserError
 
 _GEOMETRY, _DISTORTION, _BOUNDARY = 1, 2, 4  # Parts of native/rasterizer/types.h
 _TILE = 16
-UNKNOWN = -1
-"""``num_nonfinite`` of a render in a CUDA graph, whose numbers the host does not wait for."""
 
 
 @dataclass
@@ -58,24 +55,15 @@ class _Frame:
 
 
 class CudaRasterizer(KernelRasterizer, OptionalProducts):
-    """Float32 and float64 on one GPU; the same bits in every run (there are no atomic additions of floats).
-
-    In a CUDA graph (``torch.cuda.graph``) the host waits for nothing. Render the same scene once before the capture, so
-    that the memory for its pairs is known, and check ``overflowed`` after replays.
-    """
+    """Float32 and float64 on one GPU; the same bits in every run (there are no atomic additions of floats)."""
 
     def __init__(self) -> None:
         self._module: ModuleType | None = None
         self._counts = PairCounts()
-        self._captured: list[tuple[Tensor, int]] = []
 
     @classmethod
     def unavailable(cls) -> str | None:
         return cuda_extension.status()[1]
-
-    def overflowed(self) -> bool:
-        """Return whether the last replay of a CUDA graph had more pairs than memory; its image is then wrong."""
-        return any(int(totals[0]) > capacity for totals, capacity in self._captured)
 
     def pairs(self) -> int:
         """Return the number of pairs of the largest recent render on any GPU; 0 before the first."""
@@ -223,27 +211,20 @@ class CudaRasterizer(KernelRasterizer, OptionalProducts):
             )
         with cuda_extension.on_device(device):
             frame, totals = self._project(module, inputs, camera, settings)
-            capturing = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
             counts, place = self._counts, self._counts.place(device)
-            wait = None if capturing else start_copy(totals)  # The numbers of pairs and of surfels that are not finite.
+            wait = start_copy(totals)  # The numbers of pairs and of surfels that are not finite.
             guess = counts.guess(place)
             if guess is None:
-                if wait is None:
-                    raise UserError("render the scene once before it is captured into a CUDA graph.")
                 first, _ = wait()
                 counts.learn(place, first)
                 guess = float(first)
             capacity = self._bin(frame, camera, guess, n)
             render(frame)
-            if wait is None:
-                self._captured.append((totals, capacity))
-                frame.num_nonfinite = UNKNOWN
-            else:
-                pairs, frame.num_nonfinite = wait()
-                counts.learn(place, pairs)
-                if pairs > capacity:
-                    self._bin(frame, camera, float(pairs), n)
-                    render(frame)
+            pairs, frame.num_nonfinite = wait()
+            counts.learn(place, pairs)
+            if pairs > capacity:
+                self._bin(frame, camera, float(pairs), n)
+                render(frame)
         return frame
 
     def _project(

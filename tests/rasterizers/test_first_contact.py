@@ -12,8 +12,7 @@ import tried_backends
 from cuda_backends import EmulatedCudaRasterizer
 
 from beags_plugin.ops import cuda_extension
-from beags_plugin.rasterizers import RASTERIZERS, first_contact, make_rasterizer
-from beags_plugin.rasterizers.device_dispatch import DeviceDispatchRasterizer
+from beags_plugin.rasterizers import RASTERIZERS, DeviceDispatchRasterizer, first_contact, make_rasterizer
 from beags_plugin.rasterizers.first_contact import Contact, try_in_child, verdict
 from beags_plugin.rasterizers.native import NativeRasterizer
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer

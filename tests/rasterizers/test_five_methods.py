@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 from raster_scenes import CLASSES, make_scene
 
-from beags_plugin.rasterizers import RASTERIZERS
-from beags_plugin.rasterizers.device_dispatch import DeviceDispatchRasterizer
+from beags_plugin.rasterizers import RASTERIZERS, DeviceDispatchRasterizer
 from beags_plugin.rasterizers.interface import Rasterizer
 from beags_plugin.rasterizers.optional import OptionalProducts, optional_products
 from beags_plugin.rasterizers.torch_reference import TorchRasterizer
