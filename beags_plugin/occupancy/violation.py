@@ -64,11 +64,3 @@ def disc_sums(
         valid = grid.valid(points.view(-1, 3), class_ids[part].repeat(samples)).view_as(u)
         wrong[part] = weight.masked_fill(valid, 0.0).sum(0, dtype=torch.float64)
     return DiscSums(whole, wrong)
-
-
-def violation_shares(
-    surfels: Surfels, class_ids: Tensor, grid: VisibilityGrid, samples: int = 20, background: bool = True
-) -> Tensor:
-    """Return ``wrong`` / ``whole`` of ``disc_sums``, [N] float in 0..1."""
-    sums = disc_sums(surfels, class_ids, grid, samples, background)
-    return (sums.wrong / sums.whole.clamp_min(torch.finfo(torch.float64).tiny)).to(surfels.means.dtype)

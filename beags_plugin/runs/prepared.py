@@ -33,20 +33,14 @@ _REMEDY = "restore it, or refine again from base/nerfstudio_models"
 
 def read_grid(path: Path) -> VisibilityGrid | None:
     """Read the grid of a prepared refinement; None where the refiner needs none. Raises ``UserError`` if damaged."""
-    state = grid_state(path)
-    return VisibilityGrid.from_state_dict(state) if state else None
-
-
-def grid_state(path: Path, mmap: bool = False) -> dict[str, Any]:
-    """Read the tensors of a grid; empty without one. mmap: read them only when they are used."""
     try:
-        state = load_tensors(path, mmap=mmap)
+        state = load_tensors(path)
     except (OSError, ValueError) as error:
         cause = getattr(error, "strerror", None) or error
         raise UserError(f"the voxel grid {path} cannot be read ({cause}): {_REMEDY}.") from error
     if not isinstance(state, dict) or (state and not _is_grid(state)):
         raise UserError(f"the voxel grid {path} is damaged: {_REMEDY}.")
-    return state
+    return VisibilityGrid.from_state_dict(state) if state else None
 
 
 def _is_grid(state: dict[str, Any]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -27,6 +28,20 @@ _gui_api.svg_from_icon = _gui_handles.svg_from_icon = cache(_icons.svg_from_icon
 """Viser lists an archive of thousands of icons for each one that it shows."""
 
 ALWAYS = {"rgb", "depth", "normal", "accumulation"}
+
+
+def wait_until(condition: Callable[[], object], said: Callable[[], object] = str, seconds: float = 120.0) -> None:
+    """Wait until a condition holds; said: returns what a failure shows."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, said()
+        time.sleep(0.02)
+
+
+def told(tab, text: str) -> str:
+    """Return the sentence of the tab Pick, once it holds ``text``."""
+    wait_until(lambda: text in tab.note, lambda: tab.note)
+    return tab.note
 
 
 def write_finished(root: Path) -> Path:

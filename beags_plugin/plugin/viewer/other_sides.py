@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.pictures.orbit import shows
 from beags_plugin.plugin.viewer.choice import Visible
 from beags_plugin.plugin.viewer.viewing import Paint, Viewing, plain_outputs
 
@@ -29,7 +30,7 @@ def other_sides(cameras: Sequence[Camera], center: Tensor, clicked: Sequence[Ten
     center: [3], of the object. clicked: camera centres [3] of all clicks.
     """
     center = center.double()
-    seeing = [index for index, camera in enumerate(cameras) if _sees(camera, center)]
+    seeing = [index for index, camera in enumerate(cameras) if shows(camera, center)]
     towards = {index: _direction(cameras[index].center, center) for index in seeing}
     near = [_direction(each, center) for each in clicked]
     chosen: list[int] = []
@@ -42,13 +43,6 @@ def other_sides(cameras: Sequence[Camera], center: Tensor, clicked: Sequence[Ten
 
 def _direction(place: Tensor, center: Tensor) -> Tensor:
     return torch.nn.functional.normalize(place.double().cpu() - center, dim=0)
-
-
-def _sees(camera: Camera, center: Tensor) -> bool:
-    local = camera.rotation.double().cpu() @ center + camera.translation.double().cpu()
-    pixel = camera.K.double().cpu() @ local
-    column, row = (pixel[:2] / pixel[2]).tolist()
-    return float(local[2]) > 0 and 0 <= column < camera.width and 0 <= row < camera.height
 
 
 def close_camera(camera: Camera, points: Tensor) -> Camera | None:

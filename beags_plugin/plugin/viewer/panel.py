@@ -237,15 +237,9 @@ class ObjectPanel(ViewerElement[None]):
         repeat(self.follow, REFRESH_SECONDS, lambda text: self.note("panel", text))
 
     def follow(self) -> None:
-        """Update the panel; compute what the shown pictures lack, and then render them again."""
+        """Update the panel."""
         self.refresh_objects()
         self._write_texts()
-        run = self.viewing.run
-        if run is not None and "occupancy_violation" in self._requested():
-            if self.viewing.model.grid is None:
-                run.load_grid()
-            if self.viewing.refresh_shares():
-                self._redraw()
 
     def _requested(self) -> frozenset[str]:
         if self.viewer is None:

@@ -1,4 +1,4 @@
-"""Pictures of classes, boundary errors and values per Gaussian."""
+"""Pictures of classes and boundary errors."""
 
 from __future__ import annotations
 
@@ -35,16 +35,6 @@ def boundary_picture(
     boundary = rasterizer.rasterize(inputs, camera, bare, inputs.means.new_zeros(3), mask).boundary
     assert boundary is not None
     return boundary[..., None]
-
-
-@torch.no_grad()
-def value_picture(
-    rasterizer: Rasterizer, surfels: Surfels, values: Tensor, camera: Camera, settings: RasterSettings
-) -> Tensor:
-    """Return [H, W, 1], a value per Gaussian composited like a colour: sum_i w_i value_i. values: [N] float."""
-    inputs = replace(geometry_inputs(surfels), colors=values[:, None].expand(-1, 3).to(surfels.means).contiguous())
-    bare = replace(settings, geometry=False, distortion=False)
-    return rasterizer.rasterize(inputs, camera, bare, inputs.means.new_zeros(3)).color[..., :1]
 
 
 def fitted_camera(camera: Camera, width: int, height: int) -> Camera:

@@ -1,4 +1,4 @@
-"""Parts of a run that a viewer shows besides its scene: the training views' masks, and the voxel grid."""
+"""Parts of a run that a viewer shows besides its scene: the training views and their masks."""
 
 from __future__ import annotations
 
@@ -14,9 +14,7 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import resize_nearest
 from beags_plugin.labels.classes import read_id_mask
-from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.runs.layout import EXTRACTION_FILE, PREPARED, digest_of_prepared, files_digest, preparing_run
-from beags_plugin.runs.prepared import grid_state, read_grid
 from beags_plugin.runs.run import Run
 from beags_plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.views.views import unique_names
@@ -28,10 +26,9 @@ _KEPT_MASKS = 8  # Masks in memory, of the last views.
 
 
 class ViewedRun:
-    """A run on disk with its data manager. The panel calls ``load_grid``, which is slow.
+    """A run on disk with its data manager.
 
-    folder: of the run. names: of the training views. cameras: theirs, without lens distortion. grid: the voxel grid of
-    a finished run; None until ``load_grid``.
+    folder: of the run. names: of the training views. cameras: theirs, without lens distortion.
     """
 
     def __init__(self, folder: Path, datamanager: BeagsDataManager) -> None:
@@ -42,7 +39,6 @@ class ViewedRun:
         self.has_masks = any(path is not None for path in dataset.metadata["mask_filenames"])
         cameras = dataset.cameras
         self.cameras: list[Camera] = [camera_from_nerfstudio(cameras, index) for index in range(len(cameras))]
-        self.grid: VisibilityGrid | None = None
         self._before = lru_cache(_KEPT_MASKS)(datamanager.files["train"].mask_labels)
         self.refining: Callable[[], bool] = lambda: True  # Whether the scene has been prepared.
         self._after = lru_cache(_KEPT_MASKS)(_read_mask)
@@ -71,8 +67,8 @@ class ViewedRun:
         if folder is None or not self._replaced(folder):
             return None
         return (
-            f"No masks after reprojection and no voxel grid: {preparing_run(self.folder)} has been trained again since "
-            "this was extracted from it. Extract it again."
+            f"No masks after reprojection: {preparing_run(self.folder)} has been trained again since this was "
+            "extracted from it. Extract it again."
         )
 
     def _folder(self) -> Path | None:
@@ -89,19 +85,6 @@ class ViewedRun:
         except OSError:  # The folder is being replaced.
             return True
         return now != self._kept
-
-    @property
-    def has_grid(self) -> bool:
-        """Return whether refinement was prepared with a voxel grid; without one the file is empty."""
-        return self.prepared is not None and bool(grid_state(self.prepared / "grid.pt", mmap=True))
-
-    def load_grid(self) -> bool:
-        """Read the voxel grid; return whether there was one to read."""
-        prepared = self.prepared
-        if self.grid is not None or prepared is None:
-            return False
-        self.grid = read_grid(prepared / "grid.pt")
-        return self.grid is not None
 
     def mask(self, view: int, kind: str, width: int, height: int) -> Tensor | None:
         """Return a training view's mask [height, width] int32 "before" or "after" reprojection; None without one.

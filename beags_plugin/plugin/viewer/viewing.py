@@ -15,7 +15,6 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.occupancy.violation import violation_shares
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.viewer.choice import Choice, Visible, visible_part
 from beags_plugin.plugin.viewer.pace import Pace
@@ -25,7 +24,6 @@ from beags_plugin.plugin.viewer.pictures import (
     fitted_camera,
     framed,
     nearest_view,
-    value_picture,
 )
 from beags_plugin.rasterizers.rendering import render_class_map, surfel_inputs
 from beags_plugin.system.errors import UserError
@@ -40,7 +38,6 @@ CHANNELS = {
     "class_map": 3,
     "class_confidence": 1,
     "boundary_error": 1,
-    "occupancy_violation": 1,
     "mask_before": 3,
     "mask_after": 3,
 }
@@ -117,20 +114,12 @@ def within(model: SceneModel, box: OrientedBox | None) -> Tensor | None:
     return None if box is None else box.within(model.means).reshape(-1)
 
 
-@dataclass(frozen=True)
-class Shares:
-    """Result of ``violation_shares`` for the scene in the state ``key``."""
-
-    key: tuple
-    values: Tensor
-
-
 class Viewing:
     """Renders the pictures of a model for a viewer.
 
-    The panel's threads set ``choice`` and ``shares``; the viewer's render threads call ``outputs``. Nerfstudio raises
-    an exception between any two lines of an obsolete rendering, and any other exception ends the render thread for
-    good. So a rendering stores its results by one assignment, and a failure becomes a note.
+    The panel's threads set ``choice``; the viewer's render threads call ``outputs``. Nerfstudio raises an exception
+    between any two lines of an obsolete rendering, and any other exception ends the render thread for good. So a
+    rendering stores its results by one assignment, and a failure becomes a note.
 
     background: [3], the viewer's. listed: names of ``CHANNELS`` that this run offers, fixed as long as a viewer runs.
     requested: returns those that are visible now. crop_box: returns the viewer's. run: the run's files. notes: remarks
@@ -146,13 +135,11 @@ class Viewing:
         self.requested: Callable[[], frozenset[str]] = frozenset
         self.crop_box: Callable[[], OrientedBox | None] = lambda: None
         self.run: ViewedRun | None = None
-        self.shares: Shares | None = None
         self.notes: dict[str, str] = {}
         self.pace = Pace()
         self.paint: Paint | None = None
         self.errand: Errand | None = None
         self.lock = threading.Lock()
-        self._rest_until = 0.0
 
     def attach(self, run: ViewedRun, training: bool, lock: threading.Lock | None) -> None:
         """Connect to a viewer.
@@ -168,7 +155,6 @@ class Viewing:
             "class_map": classes,
             "class_confidence": classes,
             "boundary_error": classes and run.has_masks,
-            "occupancy_violation": prepares or run.has_grid,
             "mask_before": run.has_masks,
             "mask_after": prepares or run.prepared is not None,
         }
@@ -211,23 +197,12 @@ class Viewing:
                 outputs.update(class_outputs(model, scene, camera))
             else:
                 notes["classes"] = f"No class map: {NO_CLASSES}"
-        if "occupancy_violation" in requested:
-            outputs.update(self._violation(scene, camera, notes))
         if names := requested & OF_TRAINING_VIEWS:
             outputs.update(self._of_training_view(names, scene, camera, notes))
         self.notes = notes
         spent = time.perf_counter() - started, time.process_time() - worked
         self.pace.took(camera.width * camera.height, len(scene.surfels), *spent)
         return outputs
-
-    def _violation(self, scene: Visible, camera: Camera, notes: dict[str, str]) -> dict[str, Tensor]:
-        shares = self.shares
-        if shares is None or len(shares.values) != self.model.num_points:
-            notes["violation"] = "occupancy_violation is being computed, or there is no voxel grid yet."
-            return {}
-        values = shares.values if scene.index is None else shares.values[scene.index]
-        settings = self.model.settings()
-        return {"occupancy_violation": value_picture(self.model.rasterizer, scene.surfels, values, camera, settings)}
 
     def _of_training_view(
         self, names: frozenset[str], scene: Visible, camera: Camera, notes: dict[str, str]
@@ -274,27 +249,3 @@ class Viewing:
         with self.lock:
             members = self.model.members()
             return self.model.surfels().detach().clone(), Membership(members.class_ids.clone(), members.objects)
-
-    def refresh_shares(self) -> bool:
-        """Compute the shares behind ``occupancy_violation`` if the scene has changed, and return whether it has.
-
-        The work happens outside the lock, so that neither training nor rendering waits. It takes at most a tenth of the
-        time.
-        """
-        model = self.model
-        grid = model.grid or (None if self.run is None else self.run.grid)
-        started = time.perf_counter()
-        if grid is None or not bool(model.assigned) or started < self._rest_until:
-            return False
-        with self.lock:
-            key = (id(grid), model.num_points, model.step, int(model.refined_steps))
-            if self.shares is not None and self.shares.key == key:
-                return False
-            surfels, class_ids = model.surfels().clone(), model.class_ids.clone()
-        spec = model.config.losses.get("occupancy")
-        background = bool(spec.options.get("background", True)) if spec else True
-        background = background and bool((grid.classes == 0).any())
-        self.shares = Shares(key, violation_shares(surfels, class_ids, grid, background=background))
-        now = time.perf_counter()
-        self._rest_until = now + 9 * (now - started)
-        return True

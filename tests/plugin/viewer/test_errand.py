@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +14,7 @@ from solid_runs import POINTS, write_solids, write_solids_run
 pytest.importorskip("nerfstudio")
 
 from clicked_pages import click_on
-from viewer_windows import Window
+from viewer_windows import Window, told, wait_until
 
 from beags_plugin.picking.picks import Picks
 from beags_plugin.plugin.viewer import errand
@@ -57,14 +56,6 @@ def window(tmp_path, monkeypatch):
     opened.close()
 
 
-def told(tab, text: str, seconds: float = 120.0) -> str:
-    end = time.monotonic() + seconds
-    while text not in tab.note:
-        assert time.monotonic() < end, tab.note
-        time.sleep(0.02)
-    return tab.note
-
-
 def test_masks_are_saved_once_all_objects_are_picked_and_named_or_it_is_asked_for_twice(window, tmp_path, monkeypatch):
     ended = []
     monkeypatch.setattr(Errand, "end", lambda self, server: ended.append(server))
@@ -85,10 +76,7 @@ def test_masks_are_saved_once_all_objects_are_picked_and_named_or_it_is_asked_fo
     assert not ended and not (tmp_path / "picks").exists()
     tab._save()
     assert "the program that opened it goes on" in told(tab, "Saved ")
-    end = time.monotonic() + 60.0
-    while not ended:  # The sentence is shown before.
-        assert time.monotonic() < end
-        time.sleep(0.02)
+    wait_until(lambda: ended)  # The sentence is shown before.
     assert ended == [window.viewer.viser_server]
     names = json.loads((tmp_path / "picks/classes.json").read_text())
     assert sorted(names.values()) == ["background", "bear 2", "low"]
@@ -115,10 +103,7 @@ def test_a_page_is_opened_where_there_are_windows(monkeypatch, capsys):
         get_host=lambda: "127.0.0.1", get_port=lambda: 7007, on_client_disconnect=lambda heard: None
     )
     Errand(Path("out"), ("bear",)).serve(server)  # type: ignore[arg-type]
-    for _ in range(100):
-        if opened:
-            break
-        time.sleep(0.02)
+    wait_until(lambda: opened)
     assert opened == ["http://127.0.0.1:7007"] and "ssh" not in capsys.readouterr().out
 
 

@@ -6,7 +6,6 @@ import base64
 import json
 import re
 import shlex
-import time
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -24,7 +23,7 @@ pytest.importorskip("nerfstudio")
 
 from clicked_pages import VIEW, click_on, page, position
 from run_folders import ring_cameras
-from viewer_windows import Window
+from viewer_windows import Window, told, wait_until
 from written_splats import read_ply
 
 from beags_plugin.labels.classes import read_id_mask
@@ -63,26 +62,17 @@ def opened(tmp_path):
         window.close()
 
 
-def done(tab, text: str, seconds: float = 120.0) -> str:
-    """Return the panel's sentence, once it holds ``text``."""
-    end = time.monotonic() + seconds
-    while text not in tab.note:
-        assert time.monotonic() < end, tab.note
-        time.sleep(0.02)
-    return tab.note
-
-
 def click(tab, point, text: str, exclude: bool = False) -> str:
     """Click on a point of the world, and wait for what the panel says."""
     tab.excludes.value, tab.note = exclude, ""
     tab.clicked(click_on(point))
-    return done(tab, text)
+    return told(tab, text)
 
 
 def press(tab, action, text: str) -> str:
     tab.note = ""
     action()
-    return done(tab, text)
+    return told(tab, text)
 
 
 def overlap(found, exact) -> float:
@@ -131,10 +121,7 @@ def test_only_what_is_picked_is_shown_and_exported(opened):
     assert "click on it first" in press(tab, tab.files.start, "Not exported")
     click(tab, POINTS["high"], "Gaussians")
     tab.work.show_alone(True)
-    end = time.monotonic() + 60
-    while len(tab.viewing.visible().surfels) == len(OWNER):
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    wait_until(lambda: len(tab.viewing.visible().surfels) < len(OWNER))
     assert torch.equal(tab.viewing.visible().index, tab.work.picks.chosen.members.nonzero()[:, 0])
     press(tab, tab.files.start, "Exported to")
     surfels, _ = read_ply(config.parent / "exports/picked_object_1.ply")
@@ -152,7 +139,7 @@ def test_a_box_limits_the_object_and_excludes(opened):
         tab.take_box(True)
         corners = ((x + half, y + half), (x - half, y - half))
         tab.boxed(SimpleNamespace(screen_pos=corners, client=SimpleNamespace(camera=page())))
-        return done(tab, text)
+        return told(tab, text)
 
     assert "Nothing has been changed" in drag(0.001, False, "was no box")
     drag(0.06, False, "Gaussians")
@@ -169,12 +156,10 @@ def test_a_box_limits_the_object_and_excludes(opened):
     assert tab.server.scene._scene_pointer_cb is None  # the page turns again
 
 
-def heard_by(panel, tab, seconds: float = 60.0) -> None:
+def heard_by(panel, tab) -> None:
     """Wait until clicks go to this tab alone, or (None) to nobody."""
-    wanted, end = [] if tab is None else [tab.clicked], time.monotonic() + seconds
-    while ([] if (box := panel.clicks._around) is None else box._impl.click_cb) != wanted:
-        assert time.monotonic() < end, wanted
-        time.sleep(0.02)
+    wanted = [] if tab is None else [tab.clicked]
+    wait_until(lambda: ([] if (box := panel.clicks._around) is None else box._impl.click_cb) == wanted)
 
 
 def test_the_box_around_the_scene_is_seen_from_inside_and_taken_away(opened):
@@ -292,10 +277,7 @@ def test_the_other_sides_of_a_cut_are_shown_before_it_is_saved(opened):
     tab, _ = opened()
     assert tab._sides.content == ""
     click(tab, POINTS["low"], "Gaussians")
-    end = time.monotonic() + 60
-    while not tab._sides.content:
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    wait_until(lambda: tab._sides.content)
     coded = re.search(r"base64,([^\"]+)", tab._sides.content)
     picture = np.asarray(Image.open(BytesIO(base64.b64decode(coded[1])))).astype(int)
     assert picture.shape == (304, 304, 3)
@@ -305,10 +287,7 @@ def test_the_other_sides_of_a_cut_are_shown_before_it_is_saved(opened):
         for left in (0, 154):
             assert (tinted[top : top + 150, left : left + 150] > 0.3 * (red**2 + green**2 + blue**2)).mean() > 0.02
     press(tab, tab.work.undo, "nothing yet")
-    end = time.monotonic() + 60
-    while tab._sides.content:
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    wait_until(lambda: not tab._sides.content)
 
 
 def test_sides_are_far_from_the_clicks_and_from_one_another():
@@ -355,10 +334,7 @@ def test_what_is_kept_is_the_runs_for_every_command(opened):
 
 
 def _options(tab, wanted: str) -> tuple[str, ...]:
-    end = time.monotonic() + 60
-    while wanted not in tab.picked.options:
-        assert time.monotonic() < end, tab.picked.options
-        time.sleep(0.05)
+    wait_until(lambda: wanted in tab.picked.options, lambda: tab.picked.options)
     return tab.picked.options
 
 
@@ -366,10 +342,7 @@ def _correct(tab, label: str, class_id: int) -> None:
     """Choose an object of the run, and wait until clicks are about it."""
     _options(tab, label)
     tab._choose(label)
-    end = time.monotonic() + 60
-    while tab.work.picks.chosen.class_id != class_id:
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    wait_until(lambda: tab.work.picks.chosen.class_id == class_id)
 
 
 def test_an_object_of_the_run_is_corrected_and_the_run_remembers(opened):
@@ -429,7 +402,7 @@ def test_objects_of_another_programs_scene_are_picked(opened, tmp_path):
     for name, number in (("low", 1), ("high", 2)):
         tab.note = ""
         tab.clicked(SimpleNamespace(screen_pos=position(POINTS[name]), client=SimpleNamespace(camera=page(view))))
-        done(tab, "Gaussians")
+        told(tab, "Gaussians")
         assert overlap(tab.work.picks.chosen.members, OWNER[order] == number) > 0.95
         tab.work.change(lambda picks, name=name: picks.named(name).another())
     press(tab, tab.work.keep, "Kept in")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shlex
-import time
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from solid_runs import POINTS, write_solids, write_solids_run
 pytest.importorskip("nerfstudio")
 
 from clicked_pages import click_on
-from viewer_windows import Window
+from viewer_windows import Window, wait_until
 from written_splats import read_ply
 
 from beags_plugin.commands.cli import main
@@ -126,10 +125,8 @@ def exported(panel) -> str:
     """Export what is shown; return what the panel says in the end."""
     panel.notes = {}
     panel.files.start()
-    end = time.monotonic() + 120
-    while not panel.notes.get("export", "Exporting").startswith(("Exported", "Not exported")):
-        assert time.monotonic() < end, panel.notes
-        time.sleep(0.01)
+    ends = ("Exported", "Not exported")
+    wait_until(lambda: panel.notes.get("export", "Exporting").startswith(ends), lambda: panel.notes)
     return panel.notes["export"]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import threading
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +14,7 @@ from run_folders import CLASSES
 pytest.importorskip("nerfstudio")
 
 from nerfstudio.viewer.viewer_elements import ViewerClick
-from viewer_windows import ALWAYS, Window, write_finished
+from viewer_windows import ALWAYS, Window, wait_until, write_finished
 from written_splats import read_ply
 
 from beags_plugin.core.membership import Membership
@@ -41,7 +40,7 @@ def opened(finished):
 def window(opened):
     """Return the viewer of the finished run, as it is when it opens."""
     opened.model.viewing.run = ViewedRun(opened.model.viewing.run.folder, opened.model.viewing.run.datamanager)
-    opened.model.viewing.shares, opened.model.viewing.notes, opened.panel.notes = None, {}, {}
+    opened.model.viewing.notes, opened.panel.notes = {}, {}
     opened.panel.choose(Choice())
     yield opened
 
@@ -54,8 +53,6 @@ def test_every_output_is_a_picture_whatever_is_shown(window):
     for choice in choices:
         panel.choose(choice)
         for name in (*ALWAYS, *CHANNELS):
-            outputs = window.look(name)
-            panel.follow()
             outputs = window.look(name)
             shape = outputs["rgb"].shape
             for key, value in outputs.items():
@@ -155,18 +152,6 @@ def test_masks_and_boundary_are_those_of_the_nearest_training_view(window):
     assert float(window.look("boundary_error")["boundary_error"].max()) == 0.0
 
 
-def test_occupancy_violation_is_drawn_once_the_panel_has_computed_it(window):
-    assert float(window.look("occupancy_violation")["occupancy_violation"].sum()) == 0.0
-    window.panel.follow()
-    violation = window.look("occupancy_violation")["occupancy_violation"]
-    assert 0.0 < float(violation.max()) <= 1.0
-    shares, ids = window.model.viewing.shares.values, window.model.class_ids
-    assert bool((shares[ids == 2] == 1.0).all())  # the box has no voxel
-    assert bool((shares[ids == 0] == 0.0).all())  # the grid was made without the background
-    assert 0.0 < float(shares[ids == 1].mean()) < 0.9
-    assert not window.model.viewing.refresh_shares()  # nothing has changed
-
-
 def test_a_click_picks_the_object_under_the_cursor(window):
     panel, model = window.panel, window.model
     surfels, ids = model.surfels(), model.class_ids
@@ -247,10 +232,7 @@ def test_an_export_says_in_the_panel_how_it_ended(window, monkeypatch):
 
 
 def note_of(panel, beginning: str) -> str:
-    end = time.monotonic() + 120
-    while not panel.notes.get("export", "").startswith(beginning):
-        assert time.monotonic() < end, panel.notes
-        time.sleep(0.01)
+    wait_until(lambda: panel.notes.get("export", "").startswith(beginning), lambda: panel.notes)
     return panel.notes["export"]
 
 

@@ -14,8 +14,8 @@ from written_splats import read_ply
 
 pytestmark = [NEEDED, pytest.mark.slow("a browser draws a dozen views of a run by WebGL in software")]
 OUTPUTS = (
-    "rgb", "depth", "normal", "accumulation", "class_map", "class_confidence", "boundary_error", "occupancy_violation",
-    "mask_before", "mask_after",
+    "rgb", "depth", "normal", "accumulation", "class_map", "class_confidence", "boundary_error", "mask_before",
+    "mask_after",
 )  # fmt: skip
 
 

@@ -56,14 +56,12 @@ def test_masks_of_a_former_run_in_the_folder_are_not_shown_while_a_base_is_train
     window = Stand(config, SimpleNamespace(training_state="training"), lambda model: model.assigned.fill_(False))
     run = window.model.viewing.run
     assert run.mask(0, "before", 20, 12) is not None and run.mask(0, "after", 20, 12) is None
-    assert not run.has_grid and not run.load_grid()
     window.model.prepared = True  # The switch to refinement says so once it is done.
     first = run.mask(0, "after", 20, 12)
     path = tmp_path / "run/prepared/masks" / f"{run.names[0]}.png"
     write_mask(path, np.zeros((12, 20), np.uint8))  # prepared again
     os.utime(path, ns=(1, path.stat().st_mtime_ns + 1))
     assert set(first.unique().tolist()) == {0, 1, 2} and not run.mask(0, "after", 20, 12).any()
-    assert run.has_grid and run.load_grid()
 
 
 def test_a_base_opened_again_shows_no_masks_of_a_former_run_in_its_folder(tmp_path):
@@ -71,7 +69,7 @@ def test_a_base_opened_again_shows_no_masks_of_a_former_run_in_its_folder(tmp_pa
     write_prepared(tmp_path / "run", shift=1)
     window = Stand(config)
     run = window.model.viewing.run
-    assert run.mask(0, "after", 20, 12) is None and not run.has_grid and not run.load_grid()
+    assert run.mask(0, "after", 20, 12) is None
     assert set(window.look()) == ALWAYS | {"mask_before"}
 
 
@@ -83,9 +81,6 @@ def test_an_extracted_run_shows_its_object_and_the_masks_of_the_run_it_is_from(f
     assert set(outputs) == ALWAYS | set(CHANNELS)
     window.panel.follow()
     assert window.look("mask_after")["mask_after"].sum() > 0
-    window.look("occupancy_violation")
-    window.panel.follow()
-    assert window.look("occupancy_violation")["occupancy_violation"].sum() > 0
     assert window.panel.files.write() == extracted.config.parent / "exports/shown_scene.ply"
 
 
@@ -109,11 +104,11 @@ def test_an_extracted_run_whose_origin_was_trained_again_shows_none_of_its_masks
         window = Stand(each.config)
         assert set(window.look("rgb")) == ALWAYS | {"class_map", "class_confidence", "boundary_error", "mask_before"}
         assert window.panel.notes["run"] == (
-            f"No masks after reprojection and no voxel grid: {run} has been trained again since this was extracted "
-            "from it. Extract it again."
+            f"No masks after reprojection: {run} has been trained again since this was extracted from it. Extract it "
+            "again."
         )
     origin = Stand(config)  # the run itself shows what it has
-    assert origin.panel.notes == {} and {"mask_after", "occupancy_violation"} <= set(origin.look())
+    assert origin.panel.notes == {} and "mask_after" in origin.look()
     (again,) = extract_objects(config, ["cup"], output=tmp_path / "out")
     assert Stand(again.config).panel.notes == {}
 
@@ -128,7 +123,7 @@ def test_an_extracted_run_without_digests_shows_masks_and_one_without_its_origin
     assert listed == ALWAYS | {"class_map", "class_confidence", "boundary_error", "mask_before"}
     del content["prepared"]
     origin.write_text(json.dumps(content))
-    assert {"mask_after", "occupancy_violation"} <= set(Stand(extracted.config).look())
+    assert "mask_after" in Stand(extracted.config).look()
 
 
 def test_a_base_without_masks_lists_what_it_has(tmp_path):

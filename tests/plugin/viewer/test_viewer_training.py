@@ -14,7 +14,7 @@ from viewer_client import ViewerClient
 
 from beags_plugin.plugin.trainer import BeagsTrainer
 
-OUTPUTS = ["class_map", "boundary_error", "occupancy_violation", "mask_after", "depth", "rgb"]
+OUTPUTS = ["class_map", "boundary_error", "mask_after", "depth", "rgb"]
 
 
 def free_port() -> int:

@@ -17,8 +17,6 @@ from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels, opacities
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.colors import colorize
-from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.occupancy.violation import violation_shares
 from beags_plugin.plugin.viewer.aim import frame_of, place, side_of_photos
 from beags_plugin.plugin.viewer.choice import Choice, visible_part
 from beags_plugin.plugin.viewer.legend import (
@@ -40,7 +38,6 @@ from beags_plugin.plugin.viewer.pictures import (
     fitted_camera,
     framed,
     nearest_view,
-    value_picture,
 )
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs
@@ -177,16 +174,6 @@ def test_a_boundary_picture_is_the_share_of_another_class(rasterizer):
     torch.testing.assert_close(picture[..., 0], torch.where(mask == 1, alpha, torch.zeros(())))
 
 
-def test_values_are_composited_like_colours(rasterizer):
-    surfels, camera = joined(wall(0.0, opacity=0.5), wall(1.0, opacity=0.8)), view()
-    picture = value_picture(rasterizer, surfels, torch.tensor([0.25, 1.0]), camera, SETTINGS)
-    first, second = (
-        rasterizer.rasterize(geometry_inputs(part), camera, SETTINGS, torch.zeros(3)).alpha
-        for part in (surfels[:1], surfels[1:])
-    )
-    torch.testing.assert_close(picture[..., 0], 0.25 * first + (1.0 - first) * second)
-
-
 def test_class_pictures_have_the_colours_of_the_ids():
     ids = torch.tensor([[0, 1], [700, IGNORE]], dtype=torch.int32)
     assert np.array_equal((255 * class_picture(ids)).round().byte().numpy(), colorize(ids.numpy()))
@@ -248,35 +235,6 @@ def test_pictures_are_as_large_as_the_pace_allows(fixed, each, height):
         pace.took(500 * 400, 9, 1e-6, 1e-6)
     assert seen[-20:] == [(height, int(1.25 * height))] * 20
     assert fixed + each * 1.25 * height**2 < SECONDS or fixed > SECONDS or height == 32
-
-
-# -- where the occupancy loss acts -----------------------------------------------------------------------------------
-
-
-def one_voxel_grid(classes: tuple[int, ...] = (1,)) -> VisibilityGrid:
-    """Return a grid of 27 voxels of side 1 around the origin, valid for these classes."""
-    clouds = [(torch.tensor([[0.0, 0.0, 0.0]]), torch.tensor([class_id])) for class_id in classes]
-    return VisibilityGrid.from_points(clouds, 1.0, torch.full((3,), -0.5), 8)
-
-
-def test_shares_of_violation_agree_with_the_integral(ops):
-    """A disc cut by the border of the valid box: the share is the normal distribution's tail beyond it, in the disc."""
-    scale, offset = 0.4, 1.2  # valid is |x| <= 1.5: 0.3 from the centre, 0.75 of the scale
-    surfels = wall(0.0, x=offset, scale=scale)
-    shares = violation_shares(surfels, torch.tensor([1]), one_voxel_grid(), samples=20_000)
-    grid = np.linspace(-3, 3, 1201)
-    u, v = np.meshgrid(grid, grid)
-    weight = np.exp(-0.5 * (u * u + v * v)) * (u * u + v * v <= 9)
-    invalid = (offset + scale * u > 1.5) | (abs(scale * v) > 1.5)
-    assert float(shares[0]) == pytest.approx((weight * invalid).sum() / weight.sum(), abs=0.01)
-
-
-def test_shares_are_zero_inside_one_outside_and_zero_for_what_is_not_asked(ops):
-    surfels = joined(wall(0.0, scale=0.1), wall(9.0, scale=0.1), wall(9.0, scale=0.1), wall(0.0), wall(float("nan")))
-    ids = torch.tensor([1, 1, 0, 2, 1], dtype=torch.int32)
-    assert violation_shares(surfels, ids, one_voxel_grid()).tolist() == pytest.approx([0, 1, 1, 1, 0])
-    assert violation_shares(surfels, ids, one_voxel_grid(), background=False).tolist() == pytest.approx([0, 1, 0, 1, 0])
-    assert violation_shares(surfels[:0], ids[:0], one_voxel_grid()).tolist() == []
 
 
 # -- text --------------------------------------------------------------------------------------------------------------
