@@ -45,18 +45,7 @@ def resume(
     if device is not None:
         machine.device_type = device
     check_machine(machine)
-    _complete(
-        lambda: launch(
-            main_func=train_loop,
-            num_devices_per_machine=machine.num_devices,
-            device_type=machine.device_type,
-            num_machines=machine.num_machines,
-            machine_rank=machine.machine_rank,
-            dist_url=machine.dist_url,
-            config=config,
-        ),
-        config,
-    )
+    _complete(lambda: launch(train_loop, num_devices_per_machine=1, config=config), config)
 
 
 def resumed_config(run: Path, data: Path | None = None) -> BeagsTrainerConfig:

@@ -25,7 +25,6 @@ from beags_plugin.plugin.viewer.panel import ObjectPanel, ViewerLink
 from beags_plugin.plugin.viewer.viewing import Viewing, called_by_viewer, scene_outputs
 from beags_plugin.rasterizers.interface import RasterOutputs, SurfelInputs
 from beags_plugin.rasterizers.rendering import fixed_background, surfel_inputs
-from beags_plugin.system.devices import to_device_async
 from beags_plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.views.objects_alone import of_objects, where_known
 
@@ -64,7 +63,6 @@ class BeagsModel(SceneModel):
             return self.viewing.outputs(view) if called_by_viewer() else scene_outputs(self, view)
 
     def _training_outputs(self, cameras: Cameras) -> dict[str, Any]:
-        self.clock.mark("data")
         metadata = cameras.metadata or {}
         # The data manager's camera has its numbers on the host too.
         camera = metadata.get("camera") or camera_from_nerfstudio(cameras, 0).to(self.device)
@@ -82,7 +80,6 @@ class BeagsModel(SceneModel):
         settings = self.settings(geometry="geometry" in needs, distortion="distortion" in needs)
         render = self.rasterizer.rasterize(inputs, camera, settings, background, against)
         self.last_render = LastRender(camera, render, inputs.screen_shift, labels, metadata.get("close_up", False))
-        self.clock.mark("rendering")
         outputs = {"rgb": render.color, "accumulation": render.alpha[..., None], "background": background}
         if render.depth is not None:
             outputs["depth"] = render.depth[..., None]
@@ -150,7 +147,6 @@ class BeagsModel(SceneModel):
 
         own, step = self.own_training, self.step - self.schedule.base_steps
         terms = base_terms() if own is None else own.terms(inputs, step, base_terms)
-        self.clock.mark("losses")
         # A frozen scene still needs a loss to call backward on; no parameter depends on this one.
         return terms or {"none": torch.zeros((), device=self.device, requires_grad=True)}
 
@@ -184,3 +180,10 @@ class BeagsModel(SceneModel):
     ) -> list[TrainingCallback]:
         """Return the callbacks of ``plugin.training.callbacks``."""
         return training_callbacks(self, training_callback_attributes)
+
+
+def to_device_async(value: Tensor, device: torch.device) -> Tensor:
+    """Copy ``value`` from the CPU to ``device``; the host does not wait until it is there."""
+    if device.type != "cuda":
+        return value.to(device)
+    return value.pin_memory().to(device, non_blocking=True)  # The host waits for copies of memory that is not pinned.

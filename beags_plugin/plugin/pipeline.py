@@ -19,12 +19,11 @@ class BeagsPipeline(VanillaPipeline):
         config: VanillaPipelineConfig,
         device: str,
         test_mode: Literal["test", "val", "inference"] = "val",
-        world_size: int = 1,
-        local_rank: int = 0,
+        *rest: Any,
         **others: Any,
     ) -> None:
         print_user_errors_plainly()
         model = cast(BeagsModelConfig, config.model)
         data = cast(BeagsDataManagerConfig, config.datamanager)
         data.begins = test_mode == "val" and model.base_steps > 0 and model.start_from is None
-        super().__init__(config, device, test_mode, world_size, local_rank, **others)
+        super().__init__(config, device, test_mode, *rest, **others)

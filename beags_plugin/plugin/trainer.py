@@ -166,7 +166,7 @@ class BeagsTrainer(Trainer):
         """Build the scene's optimizer, once a scene to start from has replaced the parameters."""
         if self._start() is not None:
             start_from_scene(self._model, cast(BeagsDataManager, self.pipeline.datamanager), self.base_dir)
-        return SceneOptimizer(self.config.optimizers.copy(), self.pipeline.get_param_groups(), self._model.clock)
+        return SceneOptimizer(self.config.optimizers.copy(), self.pipeline.get_param_groups())
 
     def train(self) -> None:
         """Train to the end of the schedule, also after a resume (nerfstudio would train that many steps more)."""

@@ -21,7 +21,6 @@ from typing import Any, TypeVar
 
 import yaml
 
-from beags_plugin.options.loss_spec import LossSpec
 from beags_plugin.options.run_format import RUN_FORMAT
 from beags_plugin.options.scene_options import DensifyConfig, PreparationConfig, SceneOptions
 from beags_plugin.system.errors import UserError
@@ -32,12 +31,10 @@ Config = TypeVar("Config")
 _PATHS = (pathlib.PurePath, pathlib.PosixPath, pathlib.WindowsPath, pathlib.Path, pathlib.PurePosixPath)
 _FUNCTIONS = {"nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate"}  # Nerfstudio's configs name no other.
 MOVED = {
-    "beags_plugin.plugin.options.loss_spec.LossSpec": LossSpec,
     "beags_plugin.core.densification.DensifyConfig": DensifyConfig,
     "beags_plugin.preparation.pipeline.PreparationConfig": PreparationConfig,
 }
 """Names of these classes in the config.yml of older runs."""
-_GONE = ("beags_plugin.plugin.options.pyramid.PyramidConfig",)  # Options that older runs have.
 BEGINNINGS = ("load_dir", "load_checkpoint", "load_config", "load_step")  # They say what a run was started from.
 _GROUPS = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
 
@@ -71,9 +68,7 @@ class RunConfigLoader(yaml.UnsafeLoader):
         raise Refused(None, None, f"it names the module {name}", mark)
 
     def find_python_name(self, name: str, mark: Any, unsafe: bool = False) -> Any:
-        """Return the class that a tag names; ``Record`` for options of ``_GONE``."""
-        if name in _GONE:
-            return Record
+        """Return the class that a tag names."""
         if name in MOVED:
             return MOVED[name]
         module, _, attribute = name.rpartition(".")
@@ -174,7 +169,6 @@ class RunConfig:
         source = deepcopy(self.source)
         views = self.data_config
         data = {"pipeline.datamanager.data": views.data, "pipeline.datamanager.dataparser.data": views.dataparser.data}
-        _drop_gone(source)
         _set_values(source, {**dict.fromkeys(BEGINNINGS), "run_dir": folder, **data})
         return yaml.serialize(source, width=10_000)
 
@@ -262,14 +256,6 @@ def loaded(path: Path, load: Callable[[str], Any], kind: type[Config]) -> Config
     if (version := vars(config).get("run_format")) != RUN_FORMAT:
         raise other_format(path, version)
     return config
-
-
-def _drop_gone(node: yaml.Node) -> None:
-    """Drop the options of ``_GONE`` in place, because nerfstudio's loader would look for their classes."""
-    if isinstance(node, yaml.MappingNode):
-        node.value = [(key, child) for key, child in node.value if child.tag.rpartition(":")[2] not in _GONE]
-        for _, child in node.value:
-            _drop_gone(child)
 
 
 def _set_values(node: yaml.Node, values: Mapping[str, Path | int | None]) -> None:

@@ -24,7 +24,7 @@ from beags_plugin.labels.classes import write_mask
 from beags_plugin.masks.check.contradictions import Contradiction
 from beags_plugin.masks.check.issues import Issue
 from beags_plugin.objects import check_masks
-from beags_plugin.system.digests import content_digest, folder_digest
+from beags_plugin.system.digests import content_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.views.close_ups import CLOSE_UPS
 
@@ -148,9 +148,15 @@ def test_photos_without_poses_are_named(tmp_path):
     assert "1 of 30 photos has no pose and was left out (a.jpg)." in certainty(run, MadeScene(tmp_path), Again()).lines
 
 
+def write_made(data: Path) -> None:
+    """Write that a network made the masks of a scene."""
+    files = {path.name: content_digest([path]) for path in (data / "masks").glob("*.png")}
+    (data / MADE).write_text(json.dumps({"photos": "", "masks": "of all", "files": files}))
+
+
 def test_masks_to_delete_are_named_with_the_command_that_trains_again(tmp_path):
     data, overruled = write_scene(tmp_path / "data"), [f"v {index}" for index in range(14)]
-    (data / MADE).write_text(json.dumps({"photos": "", "masks": folder_digest(data / "masks")}))
+    write_made(data)
     lines = certainty(write_run(tmp_path / "run", 0.6, overruled), MadeScene(data), Again(Path("x"))).lines
     assert "14 of 20 masks were overruled" in lines[0]
     (number,) = [number for number, line in enumerate(lines) if line.startswith("    rm ")]
@@ -184,10 +190,8 @@ def test_masks_that_a_network_made_are_made_to_agree_and_those_that_were_mended_
         return "--pipeline.model.prepare.agree" in words
 
     assert not agrees()  # the user's own
-    (data / MADE).write_text(json.dumps({"photos": "", "masks": folder_digest(data / "masks")}))
-    assert as_made(data) and agrees() and not agrees("objects")  # Earlier versions wrote made.json like this.
-    files = {path.name: content_digest([path]) for path in (data / "masks").glob("*.png")}
-    (data / MADE).write_text(json.dumps({"photos": "", "masks": "of all", "files": files}))
+    write_made(data)
+    assert as_made(data) and agrees() and not agrees("objects")
     (data / "masks/v02.png").unlink()
     assert agrees() and not scene.mended, "without a mask that the user deleted the others still have shared errors"
     write_image(data / "masks/v03.png", np.zeros((12, 16), np.uint8))

@@ -51,7 +51,6 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
         switch.before_step(step)
         if curves is not None:
             curves.before_step(step)
-        model.clock.start()
         set_learning_rates(model, adam, trainer.config.optimizers, step)
         own_learning_rates(model, adam, step)
 
@@ -59,7 +58,6 @@ def training_callbacks(model: SceneModel, attributes: TrainingCallbackAttributes
         if exposure is not None:
             exposure.after_step(step)
         densifier.after_step(step)
-        model.clock.mark("growth")
         switch.after_step(step)
         if curves is not None:
             curves.after_step(step)

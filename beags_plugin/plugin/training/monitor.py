@@ -65,8 +65,6 @@ class Curves:
         """Write what is due after ``step`` (from 0); objects are measured once Gaussians have classes."""
         model = self.model
         if self.log_every > 0 and step % self.log_every == 0:
-            for part, seconds in model.clock.means().items():
-                writer.put_scalar(f"Seconds per step/{part}", seconds, step)
             writer.put_scalar("Memory (MB)/now", memory_mb(), step)
             writer.put_scalar("Memory (MB)/peak", peak_memory_mb(), step)
             self._boundaries(step)

@@ -9,8 +9,6 @@ from nerfstudio.engine.optimizers import Optimizers
 from torch.cuda.amp.grad_scaler import GradScaler
 from torch.nn import Parameter
 
-from beags_plugin.plugin.training.timing import StepClock
-
 SCENE = "scene"  # Name of the one optimizer in nerfstudio and in checkpoints.
 
 
@@ -20,16 +18,13 @@ class SceneOptimizer(Optimizers):
     ``weight_decay`` is AdamW's, which never enters the moments.
     """
 
-    def __init__(
-        self, config: dict[str, Any], param_groups: dict[str, list[Parameter]], clock: StepClock | None = None
-    ) -> None:
+    def __init__(self, config: dict[str, Any], param_groups: dict[str, list[Parameter]]) -> None:
         groups = []
         for name, parameters in param_groups.items():
             options = config[name]["optimizer"]
             groups.append({"params": parameters, "name": name, "lr": options.lr, "eps": options.eps})
             groups[-1] |= {"weight_decay": options.weight_decay, "fused": options.fused}
         self.config = config
-        self.clock = clock or StepClock()
         self.adam = torch.optim.AdamW(groups)
         self.optimizers = {SCENE: self.adam}
         self.schedulers = {}
@@ -37,7 +32,6 @@ class SceneOptimizer(Optimizers):
 
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
         """Clip the gradients of groups whose config says so, and step."""
-        self.clock.mark("backward")
         groups = self.adam.param_groups  # self.parameters holds only the first step's.
         norms = {group["name"]: self.config[group["name"]]["optimizer"].max_norm for group in groups}
         if any(norm is not None for norm in norms.values()):
@@ -47,4 +41,3 @@ class SceneOptimizer(Optimizers):
                     torch.nn.utils.clip_grad_norm_(group["params"], norm)
         if any(value.grad is not None for group in groups for value in group["params"]):
             grad_scaler.step(self.adam)
-        self.clock.mark("optimizer")

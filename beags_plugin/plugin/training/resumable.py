@@ -15,9 +15,8 @@ from beags_plugin.core.schedule import PhaseSchedule
 from beags_plugin.plugin.options.config import BeagsTrainerConfig
 from beags_plugin.plugin.training.optimizers import SceneOptimizer
 from beags_plugin.plugin.training.timing import StageSeconds
-from beags_plugin.runs.checkpoint_file import STATE, scene_alone
+from beags_plugin.runs.checkpoint_file import STATE
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.progress import say
 
 VERSION = 1  # Version of the state under the key ``STATE``.
 
@@ -84,25 +83,17 @@ class GlobalRandom:
 
 
 def training_state(checkpoint: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return the states of all parts of the training by name; none, after a message, for an older checkpoint.
+    """Return the states of all parts of the training by name; none for a scene alone.
 
     Raises ``UserError`` for a checkpoint of a newer version, or a damaged one.
     """
-    state = checkpoint.get(STATE)
-    if state is not None and not (
-        isinstance(state, dict) and isinstance(state.get("version"), int) and isinstance(state.get("parts"), dict)
-    ):
+    if (state := checkpoint.get(STATE)) is None:
+        return {}
+    if not (isinstance(state, dict) and isinstance(state.get("version"), int) and isinstance(state.get("parts"), dict)):
         raise UserError(f"the state of training in {path} is damaged: name an earlier checkpoint.")
-    if state is not None and state["version"] > VERSION:
+    if state["version"] > VERSION:
         raise UserError(
             f"{path} was saved by a newer version of beags: update beags to train on from it (viewing and evaluation "
             "work)."
         )
-    if state is None or state["version"] < VERSION:
-        if not scene_alone(checkpoint):
-            say(
-                f"{path} was saved by an older version of beags, without the order of the views and the statistics of "
-                "growth: training continues, but not bit for bit as without the break."
-            )
-        return {}
     return state["parts"]

@@ -19,7 +19,6 @@ from beags_plugin.losses import make_loss
 from beags_plugin.losses.base import Loss
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.options.model_options import BeagsModelConfig
-from beags_plugin.plugin.training.timing import StepClock
 from beags_plugin.preparation.refiner_training import OwnTraining
 from beags_plugin.rasterizers import make_rasterizer
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs
@@ -96,7 +95,6 @@ class SceneModel(SplatfactoModel):
         self.frozen = False
         self.own_training: OwnTraining | None = None
         self.last_render: LastRender | None = None
-        self.clock = StepClock()
         self.measuring = True
         self.prepared: bool | None = None
         self._known_extent: tuple[Tensor, int, float] | None = None

@@ -1,4 +1,4 @@
-"""Time of a run: the parts of a step, the stages of the run, and an estimate of how long it takes."""
+"""Time of a run: its stages, and an estimate of how long it takes."""
 
 from __future__ import annotations
 
@@ -83,36 +83,6 @@ class StageSeconds:
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from ``state``."""
         self._former = dict(state)
-
-
-class StepClock:
-    """Seconds per part of a step; a part lasts from the former mark to its own."""
-
-    def __init__(self) -> None:
-        self._last = time.perf_counter()
-        self._seconds: dict[str, float] = {}
-        self._steps = 0
-
-    def start(self) -> None:
-        """Begin a step."""
-        self._steps += 1
-        self._last = time.perf_counter()
-
-    def mark(self, part: str) -> None:
-        """End ``part`` here."""
-        now = time.perf_counter()
-        self._seconds[part] = self._seconds.get(part, 0.0) + now - self._last
-        self._last = now
-
-    def skip(self) -> None:
-        """Assign the time since the last mark to no part."""
-        self._last = time.perf_counter()
-
-    def means(self) -> dict[str, float]:
-        """Return the seconds per step of each part, since the last call."""
-        steps, self._steps = max(self._steps, 1), 0
-        means, self._seconds = {part: seconds / steps for part, seconds in self._seconds.items()}, {}
-        return means
 
 
 def _duration(seconds: float) -> str:

@@ -20,7 +20,7 @@ from beags_plugin.evaluation.violations import boundary_errors, occupancy_violat
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.plugin.trainer import BeagsTrainer
-from beags_plugin.plugin.training.timing import Estimate, StepClock
+from beags_plugin.plugin.training.timing import Estimate
 from beags_plugin.preparation import pipeline as preparation
 
 LAST = sum(STEPS) - 1
@@ -101,11 +101,9 @@ def test_every_curve_and_picture_is_in_the_event_file(run):
     iou = {name: [(e.step, e.value) for e in scalars[f"Extracted IoU/{name}"]] for name in ("cup", "box", "mean")}
     assert [step for step, _ in iou["mean"]] == [44, 49, 54, LAST]  # The first, every 5th, and the last.
     assert all(0.0 <= value <= 1.0 for each in iou.values() for _, value in each)
-    parts = {"data", "rendering", "losses", "backward", "optimizer", "growth"}
-    assert {f"Seconds per step/{part}" for part in parts} <= set(scalars)
-    assert [event.step for event in scalars["Seconds per step/rendering"]] == list(range(0, LAST + 1, 3))
     now, peak = scalars["Memory (MB)/now"], scalars["Memory (MB)/peak"]
     assert all(100 < a.value <= b.value + 1 for a, b in zip(now, peak, strict=True))
+    assert [event.step for event in now] == list(range(0, LAST + 1, 3))
     images = events.Tags()["images"]
     assert {"Scene/class map", "Objects/cup", "Objects/box"} <= set(images)
     assert [event.step for event in events.Images("Objects/cup")] == [44, 49, 54, LAST]
@@ -208,14 +206,14 @@ def test_wandb_gets_the_same(data, run, tmp_path, monkeypatch):
         assert time.monotonic() < end
         time.sleep(0.2)
     events = events_of(run)
-    clocks = ("Seconds per step", "Memory", "GPU", "Train Iter", "Train Total", "ETA")
+    clocks = ("Memory", "GPU", "Train Iter", "Train Total", "ETA")
     clocks += ("Train Rays", "Test Rays", "Vis Rays")
     tags = [tag for tag in events.Tags()["scalars"] if not tag.startswith(clocks)]
     values = [(tag, event) for tag in tags for event in events.Scalars(tag)]
     for tag, event in values:
         assert history[event.step][tag] == pytest.approx(event.value, rel=1e-5), (tag, event.step)
     assert len(values) > 100 and "Extracted IoU/mean" in history[LAST]
-    assert any({"Memory (MB)/now", "Seconds per step/rendering"} <= set(each) for each in history.values())
+    assert any("Memory (MB)/now" in each for each in history.values())
     picture = tmp_path.rglob(history[LAST]["Objects/cup/path"])
     assert len(list(picture)) == 1
 
@@ -261,17 +259,3 @@ def test_the_sums_are_those_of_the_loss(background):
     loss = OccupancyLoss(samples=7, background=background)
     inputs = LossInputs(4, 3, surfels, None, None, None, class_ids=ids, grid=grid)
     assert float(value) == pytest.approx(float(loss.value(inputs)), rel=1e-5) and float(value) > 0.01
-
-
-def test_the_clock_adds_up_parts_and_divides_by_steps(monkeypatch):
-    now = iter([0.0, 1.0, 1.5, 4.0, 10.0, 11.0, 12.0])
-    monkeypatch.setattr("time.perf_counter", lambda: next(now))
-    clock = StepClock()
-    clock.start()  # 1
-    clock.mark("data")  # 1.5
-    clock.mark("rendering")  # 4
-    clock.skip()  # 10
-    clock.mark("rendering")  # 11
-    clock.start()
-    assert clock.means() == {"data": 0.25, "rendering": 1.75}
-    assert clock.means() == {}
