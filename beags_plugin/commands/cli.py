@@ -10,7 +10,7 @@ from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Union, get_args
 
 import tyro
 from rich.markup import escape
@@ -19,11 +19,13 @@ from beags_plugin.commands.answers import CONSOLE, write_json
 from beags_plugin.commands.masks import Masks
 from beags_plugin.commands.of_runs import Clean, Eval, Export, Extract, Render
 from beags_plugin.commands.process import Process
-from beags_plugin.commands.sample import Sample
 from beags_plugin.commands.starting import check_arguments, run_config, starting
 from beags_plugin.system.errors import UserError, refused, silence_libraries
 from beags_plugin.system.output_option import OUTPUT
 from beags_plugin.system.registry import Registry
+
+if TYPE_CHECKING:
+    from beags_plugin.sample.writer import SampleConfig
 
 COMMANDS = Registry("command", "beags.commands", {})
 KNOWN = {
@@ -70,6 +72,44 @@ class Demo:
             self.data, self.output, self.preset, self.downscale, self.seed, self.fresh, self.strict, self.pick,
             self.objects, self.mask_source, self.mask_options,
         )  # fmt: skip
+
+
+@dataclass
+class Sample:
+    """Generate a scene with exact ground truth: photos, damaged masks, silhouettes, depth, objects removed."""
+
+    output: Annotated[Path, OUTPUT] = Path("outputs/sample")
+    """Folder to write."""
+    seed: int = 0
+    """Another seed gives another arrangement."""
+    width: int = 256
+    """Pixels."""
+    height: int = 192
+    """Pixels."""
+    degradation: str = "mild"
+    """How masks are damaged: none, mild or strong."""
+    views: int = 60
+    """Views to train on; 12 more are held out."""
+    family: str = "tabletop"
+    """tabletop: plain solids that touch. desk: textured objects that touch in a furnished room. Both are seen from all
+    sides. benchmarks/ adds turntable (the tabletop's solids turn while the room stands still) and room (textured
+    objects that lean on and stand in one another, seen from one side)."""
+
+    def config(self) -> SampleConfig:
+        """Return the config of the sample to write."""
+        from beags_plugin.sample.writer import SampleConfig
+
+        return SampleConfig(
+            self.seed, self.width, self.height, self.views, degradation=self.degradation, family=self.family
+        )
+
+    def run(self) -> None:
+        with starting(self):
+            from beags_plugin.sample.writer import make_sample
+
+            config = self.config()
+        make_sample(self.output, config)
+        CONSOLE.print(f"sample: {self.output}")
 
 
 @dataclass

@@ -27,6 +27,7 @@ import torch
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
+from beags_plugin.core.lifting import pixels_of
 from beags_plugin.core.minimum_cut import cut
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
@@ -228,14 +229,5 @@ class Cutter:
     def _shown_within(self, view: ViewMarks) -> np.ndarray:
         """Return which Gaussians have their centre in front of the camera and in the view's box, [N] bool."""
         assert view.within is not None
-        camera = view.camera.host
-        means = self._inputs.means.double().cpu()
-        local = means @ camera.rotation.double().T + camera.translation.double()
-        projected = local @ camera.K.double().T
-        depth = projected[:, 2]
-        pixel = torch.nan_to_num(projected[:, :2] / depth[:, None], nan=-1.0, posinf=-1.0, neginf=-1.0).floor()
-        column, row = pixel[:, 0], pixel[:, 1]
-        shown = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        within = torch.zeros(len(means), dtype=torch.bool)
-        within[shown] = view.within.cpu()[row[shown].long(), column[shown].long()]
-        return within.numpy()
+        shown, row, column, _ = pixels_of(self._inputs.means.double().cpu(), view.camera.host)
+        return (shown & view.within.cpu()[row, column]).numpy()

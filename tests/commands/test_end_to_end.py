@@ -64,20 +64,6 @@ def test_training_reports_its_stages(trained):
     assert set(report["seconds"]) == {"reprojection", "assignment", "voxel grids"}
 
 
-def test_each_loss_has_its_own_curve(trained):
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    folder, _ = trained
-    events = EventAccumulator(str(folder))
-    events.Reload()
-    tags = events.Tags()["scalars"]
-    for name in ("photometric", "boundary", "occupancy"):
-        assert any(name in tag for tag in tags), tags
-    boundary = next(tag for tag in tags if "boundary" in tag)
-    assert all(event.step >= 220 for event in events.Scalars(boundary))
-    assert all(np.isfinite(event.value) for event in events.Scalars(boundary))
-
-
 def test_the_base_is_kept_apart_and_has_classes(trained):
     from beags_plugin.runs.run import Run
 
@@ -174,20 +160,6 @@ def test_removing_an_object_keeps_the_rest(trained):
     assert rest.gaussians == int((whole.state["class_ids"] != 1).sum())
 
 
-def test_refiner_none_leaves_the_scene_as_it_is(trained, data, tmp_path):
-    from beags_plugin.runs.run import Run
-
-    folder, _ = trained
-    called(
-        "ns-train", "beags-refine", "--data", data, "--run-dir", tmp_path / "none", "--vis", "tensorboard",
-        "--load-dir", folder / "base" / "nerfstudio_models", "--pipeline.model.refine-steps", 3,
-        "--pipeline.model.refiner", "none",
-    )  # fmt: skip
-    base, kept = Run(folder / "base" / "config.yml").assigned, Run(tmp_path / "none" / "config.yml").assigned
-    for name in ("means", "quats", "scales", "opacities", "features_dc", "features_rest"):
-        assert (base.state[f"gauss_params.{name}"] == kept.state[f"gauss_params.{name}"]).all(), name
-
-
 def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, data, tmp_path):
     from beags_plugin.runs.run import Run
 
@@ -204,27 +176,15 @@ def test_a_run_that_was_refining_is_resumed_with_its_classes_and_masks(trained, 
     assert (tmp_path / "resumed" / "base" / "config.yml").exists()
 
 
-def test_a_trained_scene_is_rendered_whole_cropped_and_by_object(trained):
-    import torch
+def test_a_crop_box_leaves_nothing_outside_of_it(trained):
     from nerfstudio.data.scene_box import OrientedBox
     from nerfstudio.utils.eval_utils import eval_setup
 
-    from beags_plugin.views.cameras import camera_from_nerfstudio
-
-    folder, _ = trained
-    _, pipeline, _, _ = eval_setup(folder / "config.yml", test_mode="test")
-    model = pipeline.model
+    _, pipeline, _, _ = eval_setup(trained[0] / "config.yml", test_mode="test")
     camera = pipeline.datamanager.eval_dataset.cameras[:1]
-    whole = model.get_outputs_for_camera(camera)
-    assert {"rgb", "depth", "normal", "accumulation", "class_map"} <= set(whole)
-    assert all(value.dtype == torch.float32 and value.shape[-1] in (1, 3) for value in whole.values())
-    model.viewing.choice = model.viewing.choice.isolate(1)
-    with torch.no_grad():
-        alone = model.viewing.outputs(camera_from_nerfstudio(camera))
-    assert 0 < float(alone["accumulation"].sum()) < 0.5 * float(whole["accumulation"].sum())
-    assert torch.equal(model.get_outputs_for_camera(camera)["rgb"], whole["rgb"])  # figures never see the choice
     box = OrientedBox.from_params((9.0, 9.0, 9.0), (0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
-    assert float(model.get_outputs_for_camera(camera, obb_box=box)["accumulation"].sum()) == 0.0
+    assert float(pipeline.model.get_outputs_for_camera(camera)["accumulation"].sum()) > 0.0
+    assert float(pipeline.model.get_outputs_for_camera(camera, obb_box=box)["accumulation"].sum()) == 0.0
 
 
 def test_demo_on_a_folder_writes_table_figures_and_picture(trained, data, tmp_path):

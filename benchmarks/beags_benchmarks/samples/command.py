@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from beags_plugin.commands.sample import Sample
+from beags_plugin.commands.cli import Sample
 
 if TYPE_CHECKING:
     from beags_benchmarks.samples.config import VariedSample
