@@ -108,11 +108,6 @@ def read_object_mask(path: Path | str, truth: bool = False) -> np.ndarray:
     return np.where(untold, IGNORE, inside).astype(np.uint16)
 
 
-def read_binary_mask(path: Path | str) -> np.ndarray:
-    """Read the pixels that surely lie inside one object, [H, W] bool; see ``read_object_mask``."""
-    return read_object_mask(path) == 1
-
-
 def _is_picture(values: np.ndarray) -> bool:
     """Return whether many pixels have many shades; blended outlines are few pixels, and labels few values."""
     counts = np.bincount(values.ravel(), minlength=256)[SHADES]

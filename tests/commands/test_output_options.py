@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import io
-import re
 import typing
 
 import pytest
@@ -44,4 +42,3 @@ def test_ns_train_takes_both_names():
     for flag in ("--output", "--output-dir"):
         found = tyro.cli(kind, args=[flag, "there"], default=load_preset("beags").config)
         assert str(found.output_dir) == "there"
-        assert re.search(r"run_dir|outputs", str(dataclasses.fields(found)))

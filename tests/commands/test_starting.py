@@ -12,7 +12,7 @@ import pytest
 from run_folders import write_scene, write_trained
 
 from beags_plugin.commands.cli import main
-from beags_plugin.commands.starting import check_arguments, run_config
+from beags_plugin.commands.starting import run_config
 from beags_plugin.system.errors import UserError, check_choice
 
 pytest.importorskip("nerfstudio")
@@ -90,13 +90,6 @@ def test_a_terminal_shows_that_the_command_has_begun(folder):
 
 def test_a_run_may_be_named_by_its_folder(folder):
     assert run_config(folder / "run") == run_config(folder / "run/config.yml") == folder / "run/config.yml"
-
-
-def test_a_command_without_such_arguments_passes():
-    class Sample:
-        width = 256
-
-    check_arguments(Sample())
 
 
 def test_the_nearest_choice_is_named_whatever_its_case():

@@ -10,7 +10,6 @@ from beags_plugin.data.files import image_size
 from beags_plugin.labels.class_ids import IGNORE, count_ids
 from beags_plugin.labels.classes import (
     check_names,
-    read_binary_mask,
     read_classes,
     read_id_mask,
     read_mask,
@@ -68,8 +67,6 @@ GREY = np.array([[0, 100, 128], [255, 1, 127]], dtype=np.uint8)
 )
 def test_binary_masks_of_all_kinds(tmp_path, array, inside):
     Image.fromarray(array).save(tmp_path / "a.png")
-    mask = read_binary_mask(tmp_path / "a.png")
-    assert mask.dtype == bool and np.array_equal(mask, inside)
     ones = read_mask(tmp_path / "a.png", "binary")
     ones[ones == IGNORE] = 0  # Masks of 16 bits alone hold it.
     assert ones.dtype == np.uint16 and np.array_equal(ones, np.asarray(inside, int))
@@ -97,7 +94,6 @@ def test_grey_beside_black_and_white_alone_cannot_be_told(tmp_path, array, untol
     ids = read_object_mask(tmp_path / "a.png")
     assert ids.dtype == np.uint16 and set(ids.ravel().tolist()) <= {0, 1, IGNORE}
     assert np.array_equal(ids == IGNORE, untold)
-    assert np.array_equal(read_binary_mask(tmp_path / "a.png"), ids == 1)
     assert np.array_equal(read_mask(tmp_path / "a.png", "binary"), ids)
 
 
@@ -106,13 +102,13 @@ def test_a_picture_is_no_binary_mask(tmp_path):
     picture = np.random.default_rng(0).integers(80, 180, (40, 60, 3), dtype=np.uint8)
     Image.fromarray(picture).save(tmp_path / "photo.png")
     with pytest.raises(UserError, match="photo.png is a picture: fill the object white on black") as raised:
-        read_binary_mask(tmp_path / "photo.png")
+        read_object_mask(tmp_path / "photo.png")
     assert "\n" not in str(raised.value)
     ramp = np.clip(np.arange(600) - 170, 0, 255).astype(np.uint8)  # 192 of 1000 pixels are shades
     outline = np.concatenate([ramp, np.full(400, 255, np.uint8)])[None].repeat(3, axis=0)
     for name, array in (("blended", outline), ("grey", np.where(outline > 128, np.uint8(200), np.uint8(0)))):
         Image.fromarray(array).save(tmp_path / f"{name}.png")
-        assert (read_binary_mask(tmp_path / f"{name}.png") == (array >= 128)).all()
+        assert (read_object_mask(tmp_path / f"{name}.png") == (array >= 128)).all()
 
 
 def test_one_bit_images_are_ids_0_and_1(tmp_path):
@@ -122,7 +118,7 @@ def test_one_bit_images_are_ids_0_and_1(tmp_path):
 
 def test_missing_lossy_and_colour_files_are_refused(tmp_path):
     Image.fromarray(GREY).save(tmp_path / "a.jpg")
-    for read in (read_binary_mask, read_id_mask):
+    for read in (read_object_mask, read_id_mask):
         with pytest.raises(UserError, match="none.png does not exist"):
             read(tmp_path / "none.png")
         with pytest.raises(UserError, match="a.jpg is a JPEG"):

@@ -1,6 +1,8 @@
-"""The grid of a run is read whole, or refused in one sentence."""
+"""What a preparation wrote: its grid is read whole, or refused in one sentence; its report."""
 
 from __future__ import annotations
+
+import json
 
 import pytest
 import torch
@@ -8,7 +10,7 @@ import torch
 pytest.importorskip("nerfstudio")
 
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.runs.prepared import read_grid
+from beags_plugin.runs.prepared import PREPARATION_REPORT, dropped_background, read_grid
 from beags_plugin.system.errors import UserError
 
 
@@ -49,3 +51,11 @@ def test_a_damaged_grid_is_refused(tmp_path, name, value):
     torch.save({**grid().state_dict(), name: value}, tmp_path / "grid.pt")
     with pytest.raises(UserError, match="grid.pt is damaged: restore it"):
         read_grid(tmp_path / "grid.pt")
+
+
+@pytest.mark.parametrize("report", [{"background_voxels": False}, {"background_voxels": True}, None], ids=str)
+def test_only_a_grid_whose_background_was_left_out_is_refused(tmp_path, report):
+    """With voxels of the background wanted, there may be none all the same."""
+    if report is not None:
+        (tmp_path / PREPARATION_REPORT).write_text(json.dumps(report))
+    assert dropped_background(tmp_path) == (report == {"background_voxels": False})

@@ -17,7 +17,7 @@ from parsed_views import parse
 from beags_benchmarks.experiments.paper.downloads import POINTS, points_of, read_nvos
 from beags_plugin.commands import cli
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.classes import read_binary_mask, read_object_mask
+from beags_plugin.labels.classes import read_object_mask
 from beags_plugin.masks.sources.prompts import read_prompts
 from beags_plugin.system.errors import UserError
 
@@ -79,7 +79,7 @@ def test_nvos_is_scored_in_its_view_and_prompts_in_its_reference(fern, nvos, cap
         zip([p.stem for p in test.image_filenames], test.metadata["ground_truth"]["visible"]["fern"], strict=True)
     )
     assert [stem for stem, mask in masks.items() if mask is not None] == [TARGET]
-    assert (read_binary_mask(masks[TARGET]) == (ids(1, 4 * WIDTH, 4 * HEIGHT) > 0)).all()
+    assert ((read_object_mask(masks[TARGET]) == 1) == (ids(1, 4 * WIDTH, 4 * HEIGHT) > 0)).all()
     (prompted,) = read_prompts(fern / "prompts.json")
     prompt = prompted.prompts[REFERENCE]
     assert prompted.name == "fern" and 0 < len(prompt.points) <= 2 * POINTS
@@ -185,9 +185,9 @@ def test_what_is_there_is_kept_unless_told_otherwise(fern, nvos, capsys):
     write_image(mask, 255 * ids(1, 8 * WIDTH, 8 * HEIGHT))
     capsys.readouterr()
     assert f"{mask} exists already: add --overwrite" in refused(capsys, "--data", fern, "--nvos", nvos)
-    assert read_binary_mask(mask).shape == (8 * HEIGHT, 8 * WIDTH)
+    assert read_object_mask(mask).shape == (8 * HEIGHT, 8 * WIDTH)
     truth("--data", fern, "--nvos", nvos, "--overwrite")
-    assert read_binary_mask(mask).shape == (4 * HEIGHT, 4 * WIDTH)
+    assert read_object_mask(mask).shape == (4 * HEIGHT, 4 * WIDTH)
 
 
 def test_points_lie_far_apart_in_the_middle_of_strokes(tmp_path):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from beags_plugin.data.files import image_size, list_images
-from beags_plugin.labels.classes import read_binary_mask
+from beags_plugin.labels.classes import read_object_mask
 from beags_plugin.system.errors import UserError
 
 POINTS = 10  # most points of each kind that replace the scribbles on an object, about as many as a user clicks
@@ -98,7 +98,7 @@ def points_of(files: list[Path]) -> Iterator[tuple[float, float]]:
 
     if not files:
         return
-    scribbled = np.stack([read_binary_mask(path) for path in files]).any(axis=0)
+    scribbled = np.stack([read_object_mask(path) == 1 for path in files]).any(axis=0)
     depth = np.asarray(distance_transform_edt(np.pad(scribbled, 1)))[1:-1, 1:-1]  # scribbles end at the image's border
     rows, columns = np.nonzero(scribbled & (depth == maximum_filter(depth, 3)))  # the middle line
     if not len(rows):
