@@ -110,10 +110,6 @@ def coco(segmentation: Any, **entries: Any) -> Callable[[Path], Any]:
     return lambda data: (data / "annotations.json").write_text(json.dumps(content))
 
 
-def rle(height: int, width: int, counts: Any) -> Callable[[Path], Any]:
-    return coco({"size": [height, width], "counts": counts})
-
-
 def file(name: str, text: str) -> Callable[[Path], Any]:
     return lambda data: (data / name).write_text(text)
 

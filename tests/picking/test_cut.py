@@ -10,7 +10,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
-from touching_solids import SETTINGS, marks, pixel_of, solids, views
+from touching_solids import SETTINGS, marks, overlap, pixel_of, solids, views
 
 from beags_plugin.core.regions import Ball, Block, HalfSpace
 from beags_plugin.picking.cutter import Cutter, takes_little, takes_much
@@ -37,10 +37,6 @@ def coloured():
 @pytest.fixture(scope="module")
 def grey():
     return cutter_of(dict.fromkeys(range(3), GREY))
-
-
-def overlap(found: torch.Tensor, exact: torch.Tensor) -> float:
-    return float((found & exact).sum() / (found | exact).sum())
 
 
 @pytest.mark.parametrize("scene", ["coloured", "grey"])

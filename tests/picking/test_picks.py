@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from touching_solids import SETTINGS, marks, solids, views
+from touching_solids import SETTINGS, marks, overlap, solids, views
 
 from beags_plugin.core.membership import Membership
 from beags_plugin.picking.cutter import Cutter
@@ -30,10 +30,6 @@ def on(point):
 
 def beside(point):
     return marks(views()[3], [], [point])
-
-
-def overlap(found, exact) -> float:
-    return float((found & exact).sum() / (found | exact).sum())
 
 
 def test_two_objects_are_picked_in_turn(scene):

@@ -19,6 +19,11 @@ SPACING = 0.05
 AXES = {0: (0.5, 0.5, 0.5, 0.5), 1: (0.5**0.5, -(0.5**0.5), 0.0, 0.0), 2: (1.0, 0.0, 0.0, 0.0)}  # z onto x, y, z
 
 
+def overlap(found: torch.Tensor, exact: torch.Tensor) -> float:
+    """Return the intersection over the union of two sets, [N] bool."""
+    return float((found & exact).sum() / (found | exact).sum())
+
+
 def sheet(axis: int, level: float, low: tuple[float, float], high: tuple[float, float]) -> tuple[np.ndarray, int]:
     """Return points [n, 3] on a rectangle square to an axis, ``SPACING`` apart, and that axis."""
     grids = [np.arange(a + SPACING / 2, b, SPACING) for a, b in zip(low, high, strict=True)]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from solid_runs import write_solids, write_solids_run
-from touching_solids import solids
+from touching_solids import overlap, solids
 
 pytest.importorskip("nerfstudio")
 
@@ -56,10 +56,6 @@ def summary(page: Page, name: str, after: str = "") -> int:
     """Return the number of Gaussians that the panel gives for an object, once it does and no longer reads ``after``."""
     page.wait(lambda: re.search(rf"{name}: [\d,]+ Gaussians", page.text()) and (not after or after not in page.text()))
     return int(re.search(rf"{name}: ([\d,]+) Gaussians", page.text())[1].replace(",", ""))
-
-
-def overlap(found: torch.Tensor, exact: torch.Tensor) -> float:
-    return float((found & exact).sum() / (found | exact).sum())
 
 
 def marked(seen: np.ndarray) -> float:

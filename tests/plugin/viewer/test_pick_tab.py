@@ -17,7 +17,7 @@ import torch
 import tyro
 from PIL import Image
 from solid_runs import COLOURED, POINTS, write_solids, write_solids_run
-from touching_solids import SETTINGS, solids, views
+from touching_solids import SETTINGS, overlap, solids, views
 
 pytest.importorskip("nerfstudio")
 
@@ -73,10 +73,6 @@ def press(tab, action, text: str) -> str:
     tab.note = ""
     action()
     return told(tab, text)
-
-
-def overlap(found, exact) -> float:
-    return float((found & exact).sum() / (found | exact).sum())
 
 
 OWNER = solids(COLOURED)[1]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import socket
-
 import pytest
 
 pytest.importorskip("nerfstudio")
@@ -11,16 +9,11 @@ pytest.importorskip("msgspec")
 
 from resumed_runs import STEPS, assert_same_run, run_to_end, short_config
 from viewer_client import ViewerClient
+from viewer_pages import free_port
 
 from beags_plugin.plugin.trainer import BeagsTrainer
 
 OUTPUTS = ["class_map", "boundary_error", "mask_after", "depth", "rgb"]
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def test_a_training_that_is_watched_ends_as_it_does_unwatched(short_run, tmp_path, monkeypatch):
