@@ -90,7 +90,6 @@ def test_configs_of_runs_are_read_as_nerfstudio_reads_them(config):
 @pytest.mark.parametrize(
     ("now", "former"),
     [
-        ("options.loss_spec.LossSpec", "plugin.options.loss_spec.LossSpec"),
         ("options.scene_options.DensifyConfig", "core.densification.DensifyConfig"),
         ("options.scene_options.PreparationConfig", "preparation.pipeline.PreparationConfig"),
     ],
