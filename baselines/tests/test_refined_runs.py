@@ -18,15 +18,14 @@ pytest.importorskip("nerfstudio")
 from resumed_runs import (
     STEPS,
     checkpoint_of,
-    differences,
     interrupted,
     kill_at,
     resume_to_end,
     run_to_end,
     short_config,
-    without_clocks,
 )
 from run_folders import CLASSES, write_scene
+from same_bits import differences, without_clocks
 from viewer_windows import Window
 
 from beags_plugin.objects.evaluate import evaluate_run

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from same_bits import differences, without_clocks
 
 STEPS = 45, 12  # steps of base and refinement
 
@@ -60,25 +61,6 @@ def checkpoint_of(run: Path) -> dict:
     """Return the only checkpoint of a run."""
     (path,) = (run / "nerfstudio_models").iterdir()
     return torch.load(path, weights_only=True)
-
-
-def without_clocks(value):
-    """Return the same without the times of clocks."""
-    if isinstance(value, dict):
-        return {k: without_clocks(v) for k, v in value.items() if k not in ("seconds", "cpu_seconds", "clocks")}
-    return [without_clocks(item) for item in value] if isinstance(value, (list, tuple)) else value
-
-
-def differences(a, b, where="") -> list[str]:
-    """Return the places where two checkpoints (or other plain values) differ in a bit."""
-    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
-        same = a.dtype == b.dtype and torch.equal(a, b)
-        return [] if same else [where]
-    if isinstance(a, dict) and isinstance(b, dict) and a.keys() == b.keys():
-        return [found for key in a for found in differences(a[key], b[key], f"{where}/{key}")]
-    if isinstance(a, (list, tuple)) and isinstance(b, (list, tuple)) and len(a) == len(b):
-        return [found for i, pair in enumerate(zip(a, b, strict=True)) for found in differences(*pair, f"{where}/{i}")]
-    return [] if a == b else [where]
 
 
 def assert_same_run(one: Path, other: Path, but_for: str = "nothing"):

@@ -14,7 +14,6 @@ from resumed_runs import (
     STEPS,
     assert_same_run,
     checkpoint_of,
-    differences,
     interrupted,
     kill_at,
     killed,
@@ -23,6 +22,7 @@ from resumed_runs import (
     short_config,
 )
 from run_folders import CLASSES, write_scene
+from same_bits import differences
 
 from beags_plugin.objects.evaluate import evaluate_run
 from beags_plugin.plugin.training import contacts

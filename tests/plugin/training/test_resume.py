@@ -20,15 +20,14 @@ from resumed_runs import (
     Killed,
     assert_same_run,
     checkpoint_of,
-    differences,
     interrupted,
     kill_at,
     killed,
     resume_to_end,
     run_to_end,
     short_config,
-    without_clocks,
 )
+from same_bits import differences, without_clocks
 
 from beags_plugin.plugin.trainer import BeagsTrainer
 from beags_plugin.preparation import pipeline as preparation

@@ -7,8 +7,6 @@ from typing import Any
 
 import torch
 
-CLOCKS = ("seconds", "cpu_seconds", "clocks")
-
 
 def run_differences(whole: Path, run: Path) -> list[str]:
     """Return what differs between two complete runs: checkpoints and their content, base, masks and grids."""
@@ -50,24 +48,24 @@ def _byte_differences(one: Path, other: Path) -> list[str]:
 
 
 def _tensor_differences(one: Path, other: Path) -> list[str]:
-    return compare(*(_without_clocks(torch.load(path, weights_only=True)) for path in (one, other)), "")
+    return differences(*(without_clocks(torch.load(path, weights_only=True)) for path in (one, other)))
 
 
-def _without_clocks(value: Any) -> Any:
+def without_clocks(value: Any) -> Any:
     """Return the same without the times of clocks."""
     if isinstance(value, dict):
-        return {name: _without_clocks(item) for name, item in value.items() if name not in CLOCKS}
-    return [_without_clocks(item) for item in value] if isinstance(value, (list, tuple)) else value
+        return {name: without_clocks(item) for name, item in value.items() if name != "seconds"}
+    return [without_clocks(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
-def compare(one: Any, other: Any, where: str) -> list[str]:
+def differences(one: Any, other: Any, where: str = "") -> list[str]:
     """Return the places where two nested values differ in a bit."""
     if isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor):
         same = one.dtype == other.dtype and one.shape == other.shape
-        return [] if same and one.numpy().tobytes() == other.numpy().tobytes() else [where]
+        return [] if same and one.cpu().numpy().tobytes() == other.cpu().numpy().tobytes() else [where]
     if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
-        return [found for key in one for found in compare(one[key], other[key], f"{where}/{key}")]
+        return [found for key in one for found in differences(one[key], other[key], f"{where}/{key}")]
     if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
         pairs = enumerate(zip(one, other, strict=True))
-        return [found for index, pair in pairs for found in compare(*pair, f"{where}/{index}")]
+        return [found for index, pair in pairs for found in differences(*pair, f"{where}/{index}")]
     return [] if one == other else [where or " differs"]
