@@ -14,7 +14,6 @@ from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.export.pose_options import PoseOptions
 from beags_plugin.pictures.options import RenderOptions
 from beags_plugin.surfaces.mesh_options import MeshOptions
-from beags_plugin.system.errors import UserError
 from beags_plugin.system.output_option import OUTPUT
 from beags_plugin.system.pasted import quoted
 from beags_plugin.system.progress import progress_bar
@@ -159,10 +158,7 @@ class Clean:
 
 @dataclass
 class Render:
-    """Render objects: a turntable, a contact sheet, assignment alone beside the refined object, or a camera path.
-
-    Or, with --underlay, each alone in every held-out view, to draw its silhouette over.
-    """
+    """Render objects: a turntable, a contact sheet, assignment alone beside the refined object, or a camera path."""
 
     load_config: Path
     """A trained run: its folder, or config.yml in it."""
@@ -170,19 +166,13 @@ class Render:
     """Names of the objects; all but the background if left out."""
     format: str = "video"
     """video (.mp4 or .gif), sheet (.png or .jpg), or before-after (any of these, by the name of the file)."""
-    underlay: bool = False
-    """Write <object>/<photo>.png: each object alone over the faded photo, in every held-out view, as large as the
-    photo. A silhouette drawn over it, white on black, is read by beags eval (docs/evaluation.md)."""
     output: Annotated[Path | None, OUTPUT] = None
-    """The file (with --underlay the folder); in renders/ beside config.yml if left out."""
+    """The file; in renders/ beside config.yml if left out."""
     data: Path | None = None
     """Folder of the photos, if they were moved; their cameras tell which way is up."""
     pictures: tyro.conf.OmitArgPrefixes[RenderOptions] = RenderOptions()
 
     def run(self) -> None:
-        if self.underlay:
-            self._underlay()
-            return
         with starting(self):
             from beags_plugin.objects.render import render_run
         with progress_bar("rendering") as progress:
@@ -191,37 +181,15 @@ class Render:
             )
         CONSOLE.print(f"{self.format}: {path}")
 
-    def _underlay(self) -> None:
-        if self.format != "video" or self.pictures != RenderOptions():
-            raise UserError(
-                "an underlay has the cameras and sizes of the held-out photos: give --underlay no other option "
-                "than --load-config, --object, --output and --data."
-            )
-        with starting(self):
-            from beags_plugin.objects.underlay import write_underlays
-        with progress_bar("rendering") as progress:
-            made = write_underlays(self.load_config, self.object, self.output, progress, self.data)
-        CONSOLE.print(
-            f"underlay: {made.count} pictures in {made.folder}\n  Fill each object white on a black layer over them, "
-            f"parts that others hide too; save it as\n  {made.silhouettes}/<object>/<photo>.png; beags eval reads it."
-        )
-
 
 @dataclass
 class Eval:
-    """Score runs on their held-out views: masks per object, PSNR and SSIM, before and after refinement.
+    """Score a run on its held-out views: masks per object, PSNR and SSIM, before and after refinement."""
 
-    Several runs are scenes of one data set: a table per scene, and their mean.
-    """
-
-    load_config: tuple[Path, ...]
-    """One trained run or more: folders, or config.yml in them."""
-    data_set_name: str = "mean"
-    """Name of the mean over several runs."""
+    load_config: Path
+    """A trained run: its folder, or config.yml in it."""
     json: Path | None = None
     """File for all figures, down to single masks and views."""
-    csv: Path | None = None
-    """File for the figures of objects and scenes as a table."""
     picture: Path | None = None
     """File for a picture of the worst masks: right, missed and wrong pixels, before and after."""
     worst: int = 6
@@ -233,5 +201,5 @@ class Eval:
     def run(self) -> None:
         with starting(self):
             from beags_plugin.commands.evaluate import Outputs, run_evaluation
-        outputs = Outputs(self.json, self.csv, self.picture, self.worst)
-        run_evaluation(self.load_config, self.data_set_name, self.protocol, outputs, self.data)
+        outputs = Outputs(self.json, self.picture, self.worst)
+        run_evaluation(self.load_config, self.protocol, outputs, self.data)

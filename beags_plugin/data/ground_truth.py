@@ -1,4 +1,4 @@
-"""Exact masks and pictures that only evaluation uses."""
+"""Exact masks that only evaluation uses."""
 
 from __future__ import annotations
 
@@ -11,25 +11,21 @@ from beags_plugin.data.files import files_of_views
 from beags_plugin.system.wording import verb
 
 FilesPerView = list[Path | None]
-OF_OBJECTS = ("visible", "silhouettes", "seen", "removed", "removed_shown")
+OF_OBJECTS = ("visible", "silhouettes", "seen")
 """Kinds of ground truth with a folder of files for each object."""
 
 
 class GroundTruth(TypedDict):
-    """Files of exact masks and pictures, one or None per view.
+    """Files of exact masks, one or None per view.
 
     masks: id images. The others map an object's name to its files. visible: binary masks of its visible part.
     silhouettes: of the whole object, without occlusion. seen: of the part of the silhouette that training photos show.
-    removed: pictures without the object. removed_shown: binary masks of the part of the silhouette where these pictures
-    show a surface that training photos show.
     """
 
     masks: FilesPerView
     visible: dict[str, FilesPerView]
     silhouettes: dict[str, FilesPerView]
     seen: dict[str, FilesPerView]
-    removed: dict[str, FilesPerView]
-    removed_shown: dict[str, FilesPerView]
 
 
 def of_views(truth: GroundTruth, chosen: Sequence[int]) -> GroundTruth:
@@ -41,7 +37,7 @@ def of_views(truth: GroundTruth, chosen: Sequence[int]) -> GroundTruth:
 
 
 def find_ground_truth(dataset: Dataset, folder: Path, images: Sequence[Path], images_root: Path) -> GroundTruth | None:
-    """Find the exact masks and pictures in ``folder`` and of the layout; None without any.
+    """Find the exact masks in ``folder`` and of the layout; None without any.
 
     ``folder`` holds masks/<stem>.png, and <kind>/<object>/<stem>.png for the other kinds; these take precedence over
     files of the layout.

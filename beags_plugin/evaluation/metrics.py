@@ -1,4 +1,4 @@
-"""Metrics of masks (Acc, IoU, BIoU) and removals, PSNR, and their means over views and objects (method, section 8)."""
+"""Metrics of masks (Acc, IoU, BIoU), PSNR, and their means over views and objects (method, section 8)."""
 
 from __future__ import annotations
 
@@ -34,21 +34,6 @@ class MaskMetrics:
 
 
 @dataclass(frozen=True)
-class RemovalMetrics:
-    """Quality of a scene without an object where the object was, or a mean; see ``removal.removal_metrics``.
-
-    psnr: dB, infinite for equal pixels. psnr_shown: over pixels whose surface training photos show. shown: their share.
-    ssim: at most 1. remains: 0..1, lower is better. None as in ``MaskMetrics``.
-    """
-
-    psnr: float | None
-    psnr_shown: float | None
-    shown: float | None
-    ssim: float | None
-    remains: float | None
-
-
-@dataclass(frozen=True)
 class CloseUpMetrics:
     """Scores of an object within its box at the resolution of the photo's file, or a mean; see ``close_up``.
 
@@ -79,16 +64,13 @@ def boundary_band(mask: np.ndarray, width: int) -> np.ndarray:
     return mask & (eroded == 0)
 
 
-def compared_masks(
-    prediction: Any, truth: Any, ignore: Any = None, protocol: Protocol | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return prediction and truth at one size and the pixels that count: three bool arrays.
+def compared_masks(prediction: Any, truth: Any, ignore: Any = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return prediction and truth at the truth's size and the pixels that count: three bool arrays [H, W].
 
-    prediction: [H', W'] bool array or tensor. truth: [H, W] bool. ignore: [H, W] bool or None. The arrays have the size
-    of the truth (of the prediction, if the protocol resizes the truth). Where a pixel does not count, the prediction is
-    set to the truth, so that ignored regions make no boundary. Raises ``ValueError`` as ``mask_metrics`` does.
+    prediction: [H', W'] bool array or tensor. truth: [H, W] bool. ignore: [H, W] bool or None. Where a pixel does not
+    count, the prediction is set to the truth, so that ignored regions make no boundary. Raises ``ValueError`` as
+    ``mask_metrics`` does.
     """
-    protocol = protocol or Protocol()
     predicted, true = _array(prediction).astype(bool), _array(truth).astype(bool)
     if predicted.ndim != 2 or true.ndim != 2 or 0 in predicted.shape or 0 in true.shape:
         raise ValueError(f"masks must be non-empty and [H, W]: got {predicted.shape} and {true.shape}.")
@@ -96,10 +78,7 @@ def compared_masks(
     if counted.shape != true.shape:
         raise ValueError(f"the ignore mask is {counted.shape} but the truth is {true.shape}.")
     if predicted.shape != true.shape:
-        if protocol.resize == "prediction":
-            predicted = resize_nearest(predicted, *true.shape)
-        else:
-            true, counted = (resize_nearest(mask, *predicted.shape) for mask in (true, counted))
+        predicted = resize_nearest(predicted, *true.shape)
     return np.where(counted, predicted, true), true, counted
 
 
@@ -114,7 +93,7 @@ def mask_metrics(
     not two-dimensional and for an ``ignore`` of another size than the truth.
     """
     protocol = protocol or Protocol()
-    predicted, true, counted = compared_masks(prediction, truth, ignore, protocol)
+    predicted, true, counted = compared_masks(prediction, truth, ignore)
 
     def iou(a: np.ndarray, b: np.ndarray) -> float | None:
         union = np.count_nonzero((a | b) & counted)
@@ -146,12 +125,12 @@ def spill(predicted: np.ndarray, true: np.ndarray, counted: np.ndarray, margin: 
     return np.count_nonzero(predicted & counted & (squared > margin**2)) / area
 
 
-def covered(prediction: Any, truth: Any, ignore: Any = None, protocol: Protocol | None = None) -> float | None:
+def covered(prediction: Any, truth: Any, ignore: Any = None) -> float | None:
     """Return the share of the truth's pixels that a mask lacks, for example because fog covers an object.
 
     None if no pixel of the truth counts. Arguments and errors are those of ``mask_metrics``.
     """
-    predicted, true, counted = compared_masks(prediction, truth, ignore, protocol)
+    predicted, true, counted = compared_masks(prediction, truth, ignore)
     area = np.count_nonzero(true & counted)
     return np.count_nonzero(true & counted & ~predicted) / area if area else None
 

@@ -9,23 +9,21 @@ from typing import Literal
 from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
-from beags_plugin.evaluation.metrics import AGREEMENT, METRICS, CloseUpMetrics, MaskMetrics, RemovalMetrics
+from beags_plugin.evaluation.metrics import AGREEMENT, METRICS, CloseUpMetrics, MaskMetrics
 
 MaskKind = Literal["extracted", "seen", "rendered"]
 MASK_KINDS: tuple[MaskKind, ...] = ("extracted", "seen", "rendered")
 """extracted: the object rendered alone. seen: the same over the parts that training photos show, if the data has a map
 of them. rendered: the object's share of the whole scene."""
-Kind = MaskKind | Literal["removal", "close_up"]
+Kind = MaskKind | Literal["close_up"]
 FIGURES: dict[Kind, tuple[str, ...]] = {
     "extracted": METRICS,
     "seen": METRICS,
     "rendered": (*AGREEMENT, "covered"),
-    "removal": tuple(field.name for field in fields(RemovalMetrics)),
     "close_up": tuple(field.name for field in fields(CloseUpMetrics)),
 }
-"""Names of the metrics of each kind. Spill belongs to objects rendered alone, covered to the whole scene. removal: the
-scene rendered without the object, if the data has an exact picture of that. close_up: the object at the resolution of
-the photo's file, if that is larger than the training image."""
+"""Names of the metrics of each kind. Spill belongs to objects rendered alone, covered to the whole scene. close_up: the
+object at the resolution of the photo's file, if that is larger than the training image."""
 KINDS = tuple(FIGURES)
 IMAGE_FIGURES = ("psnr", "psnr_fit", "psnr_shown", "shown", "psnr_objects", "ssim")
 """Metrics of whole images. psnr_fit: after the affine colour map that fits the photo best, one for each photo, clamped
@@ -53,11 +51,10 @@ class EvalView:
     without masks; predictions are resized to it. silhouettes: object id to [h, w] bool, pixels that the object covers
     when nothing stands before it. seen: object id to [h, w] bool, the part of the silhouette whose surface some
     training photo shows; metrics of the kind "seen" leave out the rest. visible_objects: object id to [h, w] bool, the
-    visible part if only some objects were labelled; scored instead of ``visible``. removed: object id to [H, W, 3]
-    float in 0..1, the exact picture without it. removed_shown: object id to [h, w] bool, the part of the silhouette
-    where that picture shows surface which some training photo shows. unknown_silhouettes, unknown_visible: object id to
-    [h, w] bool, pixels that may or may not belong to its silhouette or to its mask in ``visible_objects``; they are in
-    neither and do not count. full: the photograph at the resolution of its file, if that is larger.
+    visible part if only some objects were labelled; scored instead of ``visible``. unknown_silhouettes,
+    unknown_visible: object id to [h, w] bool, pixels that may or may not belong to its silhouette or to its mask in
+    ``visible_objects``; they are in neither and do not count. full: the photograph at the resolution of its file, if
+    that is larger.
     """
 
     camera: Camera
@@ -67,8 +64,6 @@ class EvalView:
     name: str = ""
     seen: Mapping[int, Tensor] | None = None
     visible_objects: Mapping[int, Tensor] | None = None
-    removed: Mapping[int, Tensor] | None = None
-    removed_shown: Mapping[int, Tensor] | None = None
     unknown_silhouettes: Mapping[int, Tensor] | None = None
     unknown_visible: Mapping[int, Tensor] | None = None
     full: FullPhoto | None = None
@@ -81,13 +76,12 @@ class ObjectMetrics:
     extracted: MaskMetrics | None
     rendered: MaskMetrics | None
     seen: MaskMetrics | None = None
-    removal: RemovalMetrics | None = None
     close_up: CloseUpMetrics | None = None
 
 
 @dataclass(frozen=True)
 class MaskRecord:
-    """One scored mask or removal.
+    """One scored mask.
 
     kind: see ``KINDS``. view: index of the view. truth: "silhouette" or "visible".
     """
@@ -96,7 +90,7 @@ class MaskRecord:
     class_id: int
     view: int
     truth: str
-    metrics: MaskMetrics | RemovalMetrics | CloseUpMetrics
+    metrics: MaskMetrics | CloseUpMetrics
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""Scores of a labelled scene and its objects: masks, removals, PSNR, SSIM (method, section 8)."""
+"""Scores of a labelled scene and its objects: masks, PSNR, SSIM (method, section 8)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -13,7 +13,7 @@ from torch import Tensor
 from beags_plugin.core.color_fit import affine_color_fit, apply_affine
 from beags_plugin.core.lifting import hides
 from beags_plugin.core.membership import Membership
-from beags_plugin.core.select import remove_class, select_class
+from beags_plugin.core.select import select_class
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.close_up import band_of, close_up, close_up_metrics
 from beags_plugin.evaluation.metrics import covered, mask_metrics, mean, mean_metrics, psnr
@@ -30,11 +30,9 @@ from beags_plugin.evaluation.records import (
     SceneMetrics,
     ViewRecord,
 )
-from beags_plugin.evaluation.removal import removal_metrics
 from beags_plugin.evaluation.truths import (
     extracted_truth,
     object_pixels,
-    removals,
     rendered_truth,
     resized,
     seen_truth,
@@ -60,15 +58,14 @@ def evaluate_scene(
     shown: Sequence[Tensor] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> SceneMetrics:
-    """Return the metrics of the masks and removals of each object, and of the images (method, section 8).
+    """Return the metrics of the masks of each object, and of the images (method, section 8).
 
     surfels: N Gaussians. members: their classes; None scores images only. classes: id to name; the background, 0, is
     not scored. complete: False if Gaussians were removed from the scene, so that only extracted masks can be scored.
     objects_alone: the scene was trained on objects only; only their pixels of images are scored. colors_fitted: the
     scene has learned exposures of photos; its colours are fitted to each photo by one affine map of the whole
-    rendering, and PSNR shown, PSNR objects and removals are taken after that. background: [3] behind the images; black
-    if None. shown: per view [H, W] bool, see ``shown_pixels``.
-    progress: receives (done, total) views.
+    rendering, and PSNR shown and PSNR objects are taken after that. background: [3] behind the images; black if None.
+    shown: per view [H, W] bool, see ``shown_pixels``. progress: receives (done, total) views.
     """
     protocol = protocol or Protocol()
     surfels = surfels.detach()
@@ -85,7 +82,7 @@ def evaluate_scene(
                 for class_id, mask in renderer.masks(kind, objects).items():
                     metrics = mask_metrics(mask.prediction, mask.truth, mask.ignore, protocol)
                     if kind == "rendered":
-                        hidden = covered(mask.prediction, mask.truth, mask.ignore, protocol)
+                        hidden = covered(mask.prediction, mask.truth, mask.ignore)
                         metrics = replace(metrics, spill=None, covered=hidden)
                     masks.append(MaskRecord(kind, class_id, index, mask.source, metrics))
             image = ViewRecord(view.name, None, None)
@@ -116,14 +113,6 @@ def evaluate_scene(
                             rendered = fitted_colors(rendered, affine).to(rendered)
                         metrics = close_up_metrics(part, class_id, rendered, agreement)
                         masks.append(MaskRecord("close_up", class_id, index, mask.source, metrics))
-                for class_id, exact, silhouette, known in removals(view, [] if objects_alone else objects):
-                    assert members is not None
-                    rest = renderer.image(remove_class(surfels, members, class_id)[0], background)
-                    if colors_fitted:  # The fit is that with the object: a fit of its own would hide remains.
-                        rest = fitted_colors(rest, affine).to(rest)
-                    known = None if known is None else known.to(rest.device)
-                    metrics = removal_metrics(rest, photo, exact.to(rest), silhouette.to(rest.device), known)
-                    masks.append(MaskRecord("removal", class_id, index, "silhouette", metrics))
             images.append(image)
             if progress is not None:
                 progress(index + 1, len(views))
@@ -133,7 +122,7 @@ def evaluate_scene(
         return mean_metrics(r.metrics for r in masks if r.kind == kind and r.class_id == class_id)
 
     return SceneMetrics(
-        mean=ObjectMetrics(**{kind: pooled_average({0: masks}, kind, protocol) for kind in KINDS}),
+        mean=ObjectMetrics(**{kind: mean_metrics(r.metrics for r in masks if r.kind == kind) for kind in KINDS}),
         objects={c: ObjectMetrics(**{kind: of_object(c, kind) for kind in KINDS}) for c in objects},
         extracted_truth="both" if len(truths) == 2 else next(iter(truths), None),
         masks=tuple(masks),
@@ -154,17 +143,6 @@ def psnr_after_fit(rendered: Tensor, photo: Tensor) -> float:
     rendered, photo: [H, W, 3] float in 0..1. Differences in exposure or white balance alone do not count.
     """
     return psnr(fitted_colors(rendered, affine_color_fit(rendered, photo)), photo)
-
-
-def pooled_average(scenes: Mapping[Hashable, Iterable[MaskRecord]], kind: Kind, protocol: Protocol) -> Any:
-    """Return the mean of one kind of metrics over one scene, or several as if they were one; None without any."""
-    groups: dict[Hashable, list[Any]] = {}
-    for scene, masks in scenes.items():
-        for record in masks:
-            if record.kind == kind:
-                key = {"masks": 0, "objects": (scene, record.class_id), "views": (scene, record.view)}
-                groups.setdefault(key[protocol.scene_average], []).append(record.metrics)
-    return mean_metrics(mean_metrics(group) for group in groups.values())
 
 
 @dataclass(frozen=True)

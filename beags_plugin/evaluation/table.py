@@ -7,20 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import FIGURES, KINDS, MASK_KINDS, ObjectMetrics
-from beags_plugin.evaluation.removal import TELLING
-from beags_plugin.evaluation.report import DataSetMetrics, RunMetrics, Stage
+from beags_plugin.evaluation.report import RunMetrics, Stage
 from beags_plugin.evaluation.shown import TAU
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-_HEADINGS = {"acc": "Acc", "iou": "IoU", "biou": "BIoU", "psnr": "PSNR", "ssim": "SSIM", "remains": "remains"}
-_HEADINGS |= {"psnr_shown": "shown", "shown": "pixels", "spill": "spill"}
-_IN_IMAGES = {"psnr": "\nPSNR", "psnr_fit": "after\ncolour fit", "psnr_shown": "\nshown", "psnr_objects": "\nobjects"}
-_IN_IMAGES |= {"ssim": "\nSSIM"}
+_HEADINGS = {"acc": "Acc", "iou": "IoU", "biou": "BIoU", "psnr": "PSNR", "ssim": "SSIM", "spill": "spill"}
 _STAGE_NAMES = {"before": "assigned", "after": "refined"}  # names in summary.json
-_Row = tuple[str, Mapping[str, Any], Mapping[str, Any] | None]
-"""A row's name, its metrics {kind: {stage: {metric: value}}}, and its ``IMAGE_FIGURES`` or None."""
+_Row = tuple[str, Mapping[str, Any]]
+"""A row's name and its metrics {kind: {stage: {metric: value}}}."""
 _TRUTHS = {
     "silhouette": "whole occlusion-free silhouettes",
     "visible": "visible masks, less the pixels where another object stands nearer",
@@ -59,10 +55,9 @@ def render_run(
     content, stages = run.to_json(), list(run.stages())
     parts: list[RenderableType] = []
     if run.after.mean != ObjectMetrics(None, None):
-        rows = [(name, row, None) for name, row in content["objects"].items()]
-        rows.append(("mean", content["mean"], None))
-        parts.append(_mask_table(run.scene, "object", [*rows, *_worst(content)], stages))
-        parts += _more_tables(run.scene, "object", rows, stages)
+        rows = [*content["objects"].items(), ("mean", content["mean"])]
+        parts.append(_mask_table(run.scene, [*rows, *_worst(content)], stages))
+        parts += _close_up_table(run.scene, rows, stages)
     else:
         parts.append(Text(run.scene))
     lines = []
@@ -78,61 +73,31 @@ def render_run(
         lines.append("Seconds: " + ", ".join(f"{stage} {value:.1f}" for stage, value in seconds.items()))
     if peak_memory_mb:
         lines.append(f"Peak memory: {peak_memory_mb:.0f} MB")
-    return Group(*parts, *(Text(line) for line in (*lines, *run.notes, protocol_line([run])) if line))
+    return Group(*parts, *(Text(line) for line in (*lines, *run.notes, protocol_line(run)) if line))
 
 
-def render_data_set(metrics: DataSetMetrics) -> RenderableType:
-    """Return tables of several runs: the means of each scene, its worst object, then the means of the data set."""
-    from rich.console import Group
-    from rich.text import Text
-
-    content = metrics.to_json()
-    stages: list[Stage] = [stage for stage in ("before", "after") if any(stage in run.stages() for run in metrics.runs)]
-    scenes: list[list[_Row]] = []
-    for run, scene in zip(metrics.runs, content["scenes"], strict=True):
-        scenes.append([(run.scene, scene["mean"], scene), *_worst(scene)])
-    scenes.append([(metrics.name, content["mean"], content)])
-    table = _mask_table("All scenes", "scene", [row for scene in scenes for row in scene], stages)
-    more = _more_tables("All scenes", "scene", [scene[0] for scene in scenes], stages)
-    protocol = protocol_line(metrics.runs)
-    return Group(table, *more, *([Text(protocol)] if protocol else []))
-
-
-def protocol_line(runs: Sequence[RunMetrics]) -> str:
-    """Return sentences with all choices behind the scores of runs of one protocol; "" if none needs one."""
+def protocol_line(run: RunMetrics) -> str:
+    """Return sentences with all choices behind the scores of a run; "" if none needs one."""
+    after = run.after
     return protocol_sentence(
-        runs[0].protocol,
-        [run.after.extracted_truth for run in runs],
-        removal=any(run.after.mean.removal is not None for run in runs),
-        shown=any(run.after.shown is not None for run in runs),
-        fitted=any(run.after.colors_fitted for run in runs),
+        run.protocol, [after.extracted_truth], shown=after.shown is not None, fitted=after.colors_fitted
     )
 
 
-def protocol_sentence(
-    protocol: Protocol, truths: Iterable[str | None], *, removal: bool, shown: bool, fitted: bool
-) -> str:
+def protocol_sentence(protocol: Protocol, truths: Iterable[str | None], *, shown: bool, fitted: bool) -> str:
     """Return sentences with all choices behind scores; "" if none needs one.
 
-    truths: ``SceneMetrics.extracted_truth`` of each scene; without any, no mask is scored. removal, shown: whether
-    there are such metrics. fitted: whether a run has learned exposures.
+    truths: ``SceneMetrics.extracted_truth`` of each scene; without any, no mask is scored. shown: whether there are
+    such metrics. fitted: whether a run has learned exposures.
     """
     known = {truth for truth in truths if truth is not None}
     sentences = []
     if known:
         truth = _TRUTHS[next(iter(known)) if len(known) == 1 else "both"]
-        scenes = "over scenes" if protocol.data_set_average == "scenes" else "of all scenes pooled"
         sentences.append(
             f"Protocol: extracted masks against {truth}; above {protocol.threshold:g}; boundary band and margin of "
-            f"spill {100 * protocol.band_share:g} % of the diagonal; the {protocol.resize} is resized; masks empty in "
-            f"truth and prediction are left out, IoU and BIoU of those empty in truth alone are 0; means over "
-            f"{protocol.scene_average}, then {scenes}."
-        )
-    if removal:
-        sentences.append(
-            "Removal: the scene without the object's Gaussians against the exact picture without it, over the whole "
-            "silhouette; shown: where the latter shows surface that some training view shows; remains: pixels nearer "
-            f"to the photo, of those where the two differ by {TELLING:g} or more."
+            f"spill {100 * protocol.band_share:g} % of the diagonal; the prediction is resized; masks empty in truth "
+            "and prediction are left out, IoU and BIoU of those empty in truth alone are 0; means over masks."
         )
     if shown:
         sentences.append(
@@ -140,7 +105,7 @@ def protocol_sentence(
             f"training view shows within {100 * TAU:g} % of its depth."
         )
     if fitted and sentences:
-        what = "PSNR shown, PSNR objects and removals are" if known else "PSNR shown is"
+        what = "PSNR shown and PSNR objects are" if known else "PSNR shown is"
         sentences.append(
             f"Of runs that have learned the photos' exposures, {what} taken after the colour fit of the whole view."
         )
@@ -150,57 +115,46 @@ def protocol_sentence(
 def _worst(run: Mapping[str, Any]) -> list[_Row]:
     """Return the row of the object with the lowest extracted BIoU; no row for a single object."""
     name = run["worst"]
-    return [] if name is None or len(run["objects"]) < 2 else [(f"worst: {name}", run["objects"][name], None)]
+    return [] if name is None or len(run["objects"]) < 2 else [(f"worst: {name}", run["objects"][name])]
 
 
-def _mask_table(caption: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> RenderableType:
-    """Return a table of all kinds of mask metrics per stage, with PSNR and SSIM if any row has images."""
+def _mask_table(caption: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> RenderableType:
+    """Return a table of all kinds of mask metrics per stage."""
     # The metric covered is in files only: one more column is too many for a terminal.
     columns = [(kind, metric) for kind in MASK_KINDS for metric in FIGURES[kind] if metric != "covered"]
     columns = [c for c in columns if c[0] != "seen" or (c[1] in ("iou", "biou") and _known(rows, stages, *c))]
     meaning = " (before: assignment alone; after: after refinement)" if len(stages) == 2 else ""
-    return _table(f"{caption}: masks, %{meaning}", first, rows, stages, columns)
+    return _table(f"{caption}: masks, %{meaning}", rows, stages, columns)
 
 
-def _more_tables(caption: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> Iterator[RenderableType]:
-    """Yield a table of removals and one of close-ups, each if any row has such metrics."""
-    plain = [(name, row, None) for name, row, _ in rows]
-    if _known(rows, stages, "removal", "psnr"):
-        columns = [("removal", m) for m in FIGURES["removal"] if "shown" not in m or _known(rows, stages, "removal", m)]
-        title = f"{caption}: objects removed, PSNR in dB, pixels shown and remains in %"
-        yield _table(title, first, plain, stages, columns)
+def _close_up_table(caption: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> Iterator[RenderableType]:
+    """Yield a table of close-ups if any row has such metrics."""
     columns = [("close_up", metric) for metric in FIGURES["close_up"]]
     if any(_known(rows, stages, *column) for column in columns):
-        yield _table(
-            f"{caption}: objects at the photos' own size, PSNR in dB, masks in %", first, plain, stages, columns
-        )
+        yield _table(f"{caption}: objects at the photos' own size, PSNR in dB, masks in %", rows, stages, columns)
 
 
 def _known(rows: Sequence[_Row], stages: Sequence[Stage], kind: str, metric: str) -> bool:
-    return any(row[kind][stage][metric] is not None for _, row, _ in rows for stage in stages)
+    return any(row[kind][stage][metric] is not None for _, row in rows for stage in stages)
 
 
 def _table(
-    title: str, first: str, rows: Sequence[_Row], stages: Sequence[Stage], columns: Sequence[tuple[str, str]]
+    title: str, rows: Sequence[_Row], stages: Sequence[Stage], columns: Sequence[tuple[str, str]]
 ) -> RenderableType:
     from rich.box import SIMPLE
     from rich.table import Table
     from rich.text import Text
 
     table = Table(title=title, title_justify="left", box=SIMPLE, collapse_padding=True, pad_edge=False)
-    table.add_column(first)
+    table.add_column("object")
     table.add_column("stage")
     for index, (kind, metric) in enumerate(columns):
         new = index == 0 or columns[index - 1][0] != kind
         heading = _HEADINGS[metric]
         table.add_column(f"{kind if new else ''}\n{heading}", justify="right", min_width=len(kind) if new else 5)
-    for metric in _IN_IMAGES if any(images for *_, images in rows) else {}:
-        table.add_column(_IN_IMAGES[metric], justify="right")
-    for name, row, images in rows:
+    for name, row in rows:
         for stage in stages:
             cells = [_cell(metric, row[kind][stage][metric]) for kind, metric in columns]
-            if images is not None:
-                cells += [_cell(metric, images[metric][stage]) for metric in _IN_IMAGES]
             table.add_row(Text(name) if stage == stages[0] else "", stage, *cells)
         table.add_section()
     return table

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -59,16 +59,6 @@ def seen_truth(view: EvalView, class_id: int) -> Truth | None:
         return None
     unseen, unknown = view.silhouettes[class_id] & ~known, _of(view.unknown_silhouettes, class_id)
     return Truth("silhouette", view.silhouettes[class_id], unseen if unknown is None else unseen | unknown)
-
-
-def removals(view: EvalView, objects: Sequence[int]) -> Iterator[tuple[int, Tensor, Tensor, Tensor | None]]:
-    """Yield the objects whose removal can be scored: id, exact picture [H, W, 3], silhouette and known part [H, W]."""
-    for class_id, exact in (view.removed or {}).items():
-        silhouette, by_photos = _of(view.silhouettes, class_id), _of(view.removed_shown, class_id)
-        if class_id in objects and silhouette is not None:
-            height, width = exact.shape[:2]
-            known = None if by_photos is None else resized(by_photos, height, width)
-            yield class_id, exact, resized(silhouette, height, width), known
 
 
 def resized(mask: Tensor, height: int, width: int) -> Tensor:

@@ -40,13 +40,13 @@ def evaluate_run(config_path: Path, protocol: Protocol | None = None) -> RunMetr
 class EvaluatedRun:
     """A run on disk with its held-out views, which are read when first used.
 
-    name: of the scene in tables. data: folder of the scene if it has moved. stages: "before" and "after", or "after"
+    name: of the scene in tables. data: its folder if it has moved. stages: "before" and "after", or "after"
     alone, to the saved scenes. complete: False for a run of ``beags extract``, which holds a part of a scene.
     objects_alone: whether it was trained on the objects' pixels alone. colors_fitted: whether it has learned exposures
     of photos. classes: id to name of the classes that can be scored.
     """
 
-    def __init__(self, config_path: Path, name: str = "", data: Path | None = None) -> None:
+    def __init__(self, config_path: Path, data: Path | None = None) -> None:
         self.config_path = Path(config_path)
         self.run = Run(self.config_path, data)
         after = self.run.scene
@@ -60,7 +60,7 @@ class EvaluatedRun:
         if not self.complete:
             present = after.members.present()
             self.classes = {c: each for c, each in after.classes.items() if c in present}
-        self.name = name or scene_name(after.config)
+        self.name = scene_name(after.config)
         self.colors_fitted = any(scene.exposures is not None for scene in self.stages.values())
         self.settings, self.rasterizer = self.run.settings, self.run.rasterizer
 

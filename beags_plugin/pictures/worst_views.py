@@ -13,7 +13,6 @@ from torch import Tensor
 from beags_plugin.core.membership import Membership
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.evaluation.metrics import MaskMetrics, compared_masks
-from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import EvalView, MaskKind
 from beags_plugin.evaluation.report import RunMetrics, Stage
 from beags_plugin.evaluation.run_metrics import MaskRenderer
@@ -51,12 +50,12 @@ class WorstMask:
         return 1.0 if value is None else value
 
 
-def error_map(prediction: Tensor, truth: Tensor, ignore: Tensor | None, protocol: Protocol | None = None) -> np.ndarray:
+def error_map(prediction: Tensor, truth: Tensor, ignore: Tensor | None) -> np.ndarray:
     """Return [h, w] uint8: RIGHT in both masks, MISSED in the truth only, WRONG in the prediction only, else 0.
 
     Pixels that do not count are LEFT_OUT. Arguments and size are those of ``metrics.compared_masks``.
     """
-    predicted, true, counted = compared_masks(prediction, truth, ignore, protocol)
+    predicted, true, counted = compared_masks(prediction, truth, ignore)
     errors = np.zeros(true.shape, dtype=np.uint8)
     errors[predicted & true] = RIGHT
     errors[~predicted & true] = MISSED
@@ -109,7 +108,7 @@ def draw_worst(
             for stage, (surfels, members) in scenes.items():
                 renderer = MaskRenderer(surfels.detach(), members, view, rasterizer, settings, run.protocol)
                 mask = renderer.masks(kind, [record.class_id])[record.class_id]
-                errors[stage] = error_map(mask.prediction, mask.truth, mask.ignore, run.protocol)
+                errors[stage] = error_map(mask.prediction, mask.truth, mask.ignore)
             metrics: dict[Stage, Any] = {stage: scene.masks[index].metrics for stage, scene in run.stages().items()}
             photo = _photo(view, errors["after"].shape)
             title = f"{run.scene}, {view.name}: {names[record.class_id]}"

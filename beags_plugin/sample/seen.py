@@ -1,12 +1,11 @@
 """Find the part of an object's silhouette whose surface the training photos show.
 
 Where objects touch, photos show their surfaces nowhere, or only through a gap. An evaluation may leave such pixels of
-the silhouette out. Likewise, the surface behind an object can only be restored where some photo shows it.
+the silhouette out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +19,6 @@ MIN_VIEWS = 6  # photos that must show a patch of surface; fewer, through a gap,
 PATCH = 0.03  # side of a patch, world units: a few pixels, so that every photo that shows one has points in it
 GAP = 1  # pixels by which points of neighbouring pixels of one photo may lie apart in another at a like distance
 
-NEAR = 0.05  # relative difference of the depths of a point and of its pixel below which it may be visible
 SAME = 1e-6  # relative rounding error of the distance at which a ray ends
 
 
@@ -53,7 +51,7 @@ def seen_part(view: View, surface: np.ndarray, silhouette: np.ndarray) -> np.nda
 
     surface: [P, 3] world points of the object, from ``well_seen``. silhouette: [H, W] bool.
     """
-    _, rows, columns, _ = _landing(view, surface)
+    _, rows, columns = _landing(view, surface)
     hit = np.zeros(silhouette.shape, dtype=bool)
     hit[rows, columns] = True
     # Points of neighbouring pixels of one photo lie up to a pixel apart in another: closing fills these gaps and does
@@ -74,36 +72,17 @@ def shown_in(photo: Photo, points: np.ndarray) -> np.ndarray:
     """Return [P] bool: which world points [P, 3] of the scene's surfaces a photo shows."""
     visible = np.zeros(len(points), dtype=bool)
     inside = _landing(photo.view, points)[0]
-    visible[inside] = _reached(photo, points[inside])
+    hits, _ = first_hits(photo.scene, photo.view.center, points[inside] - photo.view.center)
+    visible[inside] = hits.t > 1.0 - SAME
     return visible
 
 
-def shown_points(points: np.ndarray, photos: Sequence[Photo]) -> np.ndarray:
-    """Return [P] bool: which world points [P, 3] of the scene's surfaces some photo shows.
-
-    The depth rules out most hidden points; rays are cast at the others.
-    """
-    visible = np.zeros(len(points), dtype=bool)
-    for photo in photos:
-        rest = np.flatnonzero(~visible)
-        inside, rows, columns, depth = _landing(photo.view, points[rest])
-        near = rest[inside[np.abs(depth - photo.depth[rows, columns]) <= NEAR * depth]]
-        visible[near] = _reached(photo, points[near])
-    return visible
-
-
-def _reached(photo: Photo, points: np.ndarray) -> np.ndarray:
-    """Return [P] bool: which world points [P, 3] on surfaces are not hidden from the photo's camera."""
-    hits, _ = first_hits(photo.scene, photo.view.center, points - photo.view.center)
-    return hits.t > 1.0 - SAME
-
-
-def _landing(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the indices [M] of the ``points`` [P, 3] inside the picture, and their rows, columns and depths."""
+def _landing(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the indices [M] of the ``points`` [P, 3] inside the picture, and their rows and columns."""
     local = (points - view.center) @ view.camera_to_world[:3, :3]
     front = np.flatnonzero(local[:, 2] < 0)
     depth = -local[front, 2]
     columns = np.floor(view.cx + view.focal * local[front, 0] / depth).astype(np.int64)
     rows = np.floor(view.cy - view.focal * local[front, 1] / depth).astype(np.int64)
     inside = (columns >= 0) & (columns < view.width) & (rows >= 0) & (rows < view.height)
-    return front[inside], rows[inside], columns[inside], depth[inside]
+    return front[inside], rows[inside], columns[inside]

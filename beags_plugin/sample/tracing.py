@@ -55,20 +55,17 @@ def hit_fixtures(
     return t, part
 
 
-def first_hits(
-    scene: Scene, origin: np.ndarray, directions: np.ndarray, without: int | None = None
-) -> tuple[Hits, list[np.ndarray]]:
+def first_hits(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> tuple[Hits, list[np.ndarray]]:
     """Find the first hits of rays from one point, and for each object the rays that would hit it if it were alone.
 
-    origin: [3], world, inside the background and outside of all objects; directions: [N, 3], any length. without: class
-    id of an object that lets all rays pass.
+    origin: [3], world, inside the background and outside of all objects; directions: [N, 3], any length.
     """
     t, surface = scene.surround(origin, directions)
     silhouettes = []
     for class_id, thing in enumerate(scene.things, start=1):
         rays, distances = object_hits(thing, origin, directions)
         silhouettes.append(rays)
-        first = (distances < t[rays]) & (class_id != without)
+        first = distances < t[rays]
         t[rays[first]] = distances[first]
         surface[rays[first]] = class_id
     return Hits(t, surface), silhouettes

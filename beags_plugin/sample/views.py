@@ -8,7 +8,7 @@ import numpy as np
 
 from beags_plugin.sample.scene import DirectLighting, Lighting, Scene
 from beags_plugin.sample.solids import turned
-from beags_plugin.sample.tracing import CHUNK, first_hits, object_hits
+from beags_plugin.sample.tracing import CHUNK, first_hits
 
 ELEVATIONS = (0.34, 0.66, 1.02)
 """Elevations of the three rounds of cameras above the ground, radians; their field of view is 48 degrees wide."""
@@ -143,46 +143,16 @@ def render_pixels(scene: Scene, light: Lighting, view: View, pixels: np.ndarray,
     return _pixels(scene, light, view, directions, samples * samples)
 
 
-def render_removed(
-    scene: Scene, light: Lighting, view: View, image: np.ndarray, class_id: int, samples: int
-) -> np.ndarray | None:
-    """Render ``image``, that of ``render_image``, with an object cut out; None if the object is not visible in it.
-
-    The light does not change: the object's shadows stay, as they do when an object is cut out of photos. Pixels whose
-    rays do not meet the object first stay the same.
-    """
-    directions, per_pixel = view.directions(*_grid(view, samples)), samples * samples
-    rays, _ = object_hits(scene.things[class_id - 1], view.center, directions)
-    first = first_hits(scene, view.center, directions[rays])[0].surface == class_id
-    places = np.unique(rays[first] // per_pixel)
-    if not len(places):
-        return None
-    removed = image.reshape(-1, 3).copy()
-    directions = directions.reshape(-1, per_pixel, 3)[places].reshape(-1, 3)
-    removed[places] = _pixels(scene, light, view, directions, per_pixel, without=class_id)
-    return removed.reshape(image.shape)
-
-
-def surface_without(scene: Scene, view: View, pixels: np.ndarray, class_id: int) -> np.ndarray:
-    """Return the world points [P, 3] that the centres of ``pixels`` [H, W] bool would show without an object."""
-    rows, columns = np.nonzero(pixels)
-    directions = view.directions(columns + 0.5, rows + 0.5)
-    hits, _ = first_hits(scene, view.center, directions, without=class_id)
-    return view.center + hits.t[:, None] * directions
-
-
-def _pixels(
-    scene: Scene, light: Lighting, view: View, directions: np.ndarray, per_pixel: int, without: int | None = None
-) -> np.ndarray:
-    """Return [P, 3] uint8 sRGB of pixels with ``per_pixel`` directions each, in order; without: see ``first_hits``."""
+def _pixels(scene: Scene, light: Lighting, view: View, directions: np.ndarray, per_pixel: int) -> np.ndarray:
+    """Return [P, 3] uint8 sRGB of pixels with ``per_pixel`` directions each, in order."""
     chunk = CHUNK // per_pixel * per_pixel
     pieces = []
     for start in range(0, len(directions), chunk):
         part = directions[start : start + chunk]
-        if without is None and isinstance(light, DirectLighting):
+        if isinstance(light, DirectLighting):
             colours = light.seen(view.center, part)
         else:
-            hits, _ = first_hits(scene, view.center, part, without)
+            hits, _ = first_hits(scene, view.center, part)
             colours = light.colours(view.center + hits.t[:, None] * part, hits.surface, part, view.center)
         pieces.append(np.minimum(colours, 1.0).reshape(-1, per_pixel, 3).mean(axis=1))
     return np.floor(255.0 * np.concatenate(pieces) ** (1.0 / 2.2) + 0.5).astype(np.uint8)

@@ -18,14 +18,14 @@ from beags_plugin.sample.degrade import Degradation, degrade_mask, dropped_views
 from beags_plugin.sample.family import Family
 from beags_plugin.sample.points import SeedPoints, find_tracks, seed_points
 from beags_plugin.sample.scene import Scene
-from beags_plugin.sample.seen import Photo, seen_part, shown_points, visible_surface, well_seen
+from beags_plugin.sample.seen import Photo, seen_part, visible_surface, well_seen
 from beags_plugin.sample.shots import Shot, taken
-from beags_plugin.sample.views import Picture, View, render_pixels, render_removed, surface_without
+from beags_plugin.sample.views import Picture, View, render_pixels
 from beags_plugin.system.errors import UserError, unwritable, writing
 from beags_plugin.system.progress import progress_bar
 from beags_plugin.system.reading.ply import write_vertices
 
-VERSION = 12
+VERSION = 13
 """Raise it whenever the same config gives other files: older samples are then rebuilt."""
 LARGEST_SIDE = 8192  # pixels
 POINT_NOISE = 0.03
@@ -112,13 +112,10 @@ def write_sample(
     Layout: transforms.json (OpenGL camera-to-world, world z up), images/<stem>.png, masks/<stem>.png (ids; degraded
     for train views, none for dropped ones, exact for test views), classes.json, seed_points.ply, and under
     ground_truth/ the exact masks/<stem>.png, silhouettes/<object>/<stem>.png (0 or 255), for test views
-    seen/<object>/<stem>.png (the part of the silhouette whose surface training photos show) and, where the photo shows
-    the object, removed/<object>/<stem>.png (the photo with the object cut out, in unchanged light) and
-    removed_shown/<object>/<stem>.png (the part of the silhouette where this surface is in some training photo), and
-    depth/<stem>.npy (float32, z along the optical axis); masks and depth are those of the pixel centres. sample.json is
-    the config. seed_tracks.json lists the training photos that show each seed point: ``photos``, their stems, and
-    ``points``, indices of photos for each point of seed_points.ply. Seed points have the colours of the mean exposure,
-    pictures without an object the exposure of their photo, which a rendering must have before it is compared.
+    seen/<object>/<stem>.png (the part of the silhouette whose surface training photos show), and depth/<stem>.npy
+    (float32, z along the optical axis); masks and depth are those of the pixel centres. sample.json is the config.
+    seed_tracks.json lists the training photos that show each seed point: ``photos``, their stems, and ``points``,
+    indices of photos for each point of seed_points.ply. Seed points have the colours of the mean exposure.
 
     All is written into a temporary folder beside ``folder`` and renamed at the end, so that an interrupted run leaves
     nothing. A folder that holds another sample is replaced; one that another program has made of ``config`` meanwhile
@@ -166,8 +163,7 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
     ends = [config.num_points * i // len(train) for i in range(len(train) + 1)]
     shares = {name: end - first for name, first, end in zip(train, ends[:-1], ends[1:], strict=True)}
     names = shots[0].still.class_names
-    kinds = ("silhouettes", "seen", "removed", "removed_shown")
-    objects = [f"ground_truth/{kind}/{name}" for kind in kinds for class_id, name in names.items() if class_id]
+    objects = [f"ground_truth/{kind}/{names[c]}" for kind in ("silhouettes", "seen") for c in range(1, len(names))]
     for sub in ("images", "masks", "ground_truth/masks", "ground_truth/depth", *objects):
         (folder / sub).mkdir(parents=True)
     seeds: list[SeedPoints] = []
@@ -181,10 +177,6 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
         mask = picture.labels
         if view.split == "test":
             silhouettes[view.name] = picture.silhouettes
-            for class_id in range(1, len(names)):
-                removed = render_removed(scene, shot.exposed, view, picture.image, class_id, config.antialias)
-                if removed is not None:
-                    _write_png(folder / "ground_truth" / "removed" / names[class_id] / f"{view.name}.png", removed)
         else:
             photos.append(Photo(view, scene, picture.depth))
             for surface, part in zip(surfaces, visible_surface(view, picture), strict=True):
@@ -202,9 +194,10 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
         if progress is not None:
             progress(done, len(views))
     whole = [well_seen(surface) for surface in surfaces]
-    for shot in shots:
-        if shot.view.name in silhouettes:
-            _write_shown(folder / "ground_truth", shot, whole, photos, silhouettes[shot.view.name])
+    for view in (view for view in views if view.name in silhouettes):
+        for class_id, (surface, silhouette) in enumerate(zip(whole, silhouettes[view.name], strict=True), start=1):
+            part = np.uint8(255) * seen_part(view, surface, silhouette)
+            _write_png(folder / "ground_truth" / "seen" / names[class_id] / f"{view.name}.png", part)
     with open(folder / "seed_points.ply", "wb") as file:
         write_vertices(file, np.concatenate([points.records for points in seeds]))
     tracks = {"photos": train, "points": find_tracks(seeds, photos, family.turns)}
@@ -248,20 +241,6 @@ def _write_truth(folder: Path, view: View, picture: Picture, names: dict[int, st
     np.save(truth / "depth" / f"{view.name}.npy", picture.depth)
     for class_id, silhouette in enumerate(picture.silhouettes, start=1):
         _write_png(truth / "silhouettes" / names[class_id] / f"{view.name}.png", np.uint8(255) * silhouette)
-
-
-def _write_shown(
-    truth: Path, shot: Shot, surfaces: list[np.ndarray], photos: list[Photo], silhouettes: np.ndarray
-) -> None:
-    """Write the parts of a test view's silhouettes where training photos show the object, and the surface behind it."""
-    scene, view = shot.scene, shot.view
-    for class_id, (surface, silhouette) in enumerate(zip(surfaces, silhouettes, strict=True), start=1):
-        place = Path(scene.class_names[class_id]) / f"{view.name}.png"
-        _write_png(truth / "seen" / place, np.uint8(255) * seen_part(view, surface, silhouette))
-        if (truth / "removed" / place).exists():
-            behind = np.zeros(silhouette.shape, np.uint8)
-            behind[silhouette] = 255 * shown_points(surface_without(scene, view, silhouette, class_id), photos)
-            _write_png(truth / "removed_shown" / place, behind)
 
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:

@@ -21,7 +21,7 @@ from beags_plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.views.photo_files import Box
 from beags_plugin.views.run_data import BothSplits
 
-_NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={}, removed={}, removed_shown={})
+_NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={})
 
 
 class HeldOutViews(Sequence[EvalView]):
@@ -102,8 +102,6 @@ class HeldOutViews(Sequence[EvalView]):
             view.name,
             seen or None,
             visible_objects or None,
-            {c: self._picture(file, index) for c, file in self._files(truth["removed"], index).items()} or None,
-            self._per_object(truth["removed_shown"], index)[0] or None,
             unknown_silhouettes or None,
             unknown_visible or None,
             self._full(index, view.camera),
@@ -131,36 +129,24 @@ class HeldOutViews(Sequence[EvalView]):
     ) -> tuple[dict[int, Tensor], dict[int, Tensor]]:
         """Read the [h, w] bool masks of a view by object id, and their unknown pixels if there are any."""
         masks, unknown = {}, {}
-        for class_id, file in self._files(files, view).items():
+        for class_id, name in self.classes.items():
+            if name not in files or (file := files[name][view]) is None:
+                continue
             ids = self._straight(file, read_object_mask(file, truth=True), view)
             masks[class_id] = torch.from_numpy(ids == 1)
             if (unlabelled := ids == IGNORE).any():  # Pixels outside the lens are among them.
                 unknown[class_id] = torch.from_numpy(unlabelled)
         return masks, unknown
 
-    def _files(self, files: Mapping[str, Sequence[Path | None]], view: int) -> dict[int, Path]:
-        """Return the file of each object in a view, by id, for those that have one."""
-        own = {c: files[name][view] for c, name in self.classes.items() if name in files}
-        return {c: file for c, file in own.items() if file is not None}
-
-    def _picture(self, file: Path, view: int) -> Tensor:
-        """Read a picture [H, W, 3] without an object in the way of the photo."""
-        self._check_proportions("picture", file, image_size(file), view)
-        return self.manager.files["eval"].picture(file, view)
-
     def _straight(self, file: Path, ids: np.ndarray, view: int) -> np.ndarray:
         """Undistort ids; raise ``UserError`` if their proportions differ from the photo's."""
-        self._check_proportions("mask", file, (ids.shape[1], ids.shape[0]), view)
-        return self.manager.files["eval"].undistorted(ids, view)
-
-    def _check_proportions(self, what: str, file: Path, size: tuple[int, int], view: int) -> None:
-        """Raise ``UserError`` if the proportions of ``size`` (width, height) differ from the photo's."""
-        (width, height), (own_width, own_height) = image_size(self.manager.eval_dataset.image_filenames[view]), size
-        if not same_proportions((width, height), size):
+        (own_height, own_width), size = ids.shape, image_size(self.manager.eval_dataset.image_filenames[view])
+        if not same_proportions(size, (own_width, own_height)):
             raise UserError(
-                f"the {what} {file} is {own_width}x{own_height} pixels but its image is {width}x{height}: "
-                f"make it in the proportions of the image."
+                f"the mask {file} is {own_width}x{own_height} pixels but its image is {size[0]}x{size[1]}: make it in "
+                "the proportions of the image."
             )
+        return self.manager.files["eval"].undistorted(ids, view)
 
 
 def _of_size(mask: Tensor, other: Tensor) -> Tensor:

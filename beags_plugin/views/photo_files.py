@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
-from pathlib import Path
 from typing import Any, Literal
 
 import cv2
@@ -76,13 +75,6 @@ class PhotoFiles:
         points = places * [int(distorted.width[index]), int(distorted.height[index])]
         straight = lens.straight_points(points, distorted, self.cameras, index)
         return camera_from_nerfstudio(self.cameras, index), straight
-
-    def picture(self, file: Path, index: int) -> Tensor:
-        """Read another picture of a view in the way of its photo, [H, W, 3] float in 0..1."""
-        image = self.dataset.get_numpy_image(index, file)
-        if lens.has_lens(self._distorted, index):
-            image = lens.undistort_image(image, self._distorted, index)
-        return torch.from_numpy(image).float() / 255.0
 
     def as_in_file(self, labels: np.ndarray, index: int, border: int = IGNORE) -> np.ndarray:
         """Restore the lens distortion of a view's file in labels [h', w'], at the size at which the file was read.

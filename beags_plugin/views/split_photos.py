@@ -51,9 +51,9 @@ class SplitPhotos:
     def __len__(self) -> int:
         return len(self.image_filenames)
 
-    def get_numpy_image(self, image_idx: int, path: Path | None = None) -> np.ndarray:
-        """Read the image [H, W, 3] uint8, sRGB, before undistortion; path: of another picture of the same view."""
-        path, size = path or self.image_filenames[image_idx], self.file_sizes[image_idx]
+    def get_numpy_image(self, image_idx: int) -> np.ndarray:
+        """Read the image [H, W, 3] uint8, sRGB, before undistortion."""
+        path, size = self.image_filenames[image_idx], self.file_sizes[image_idx]
         return resize_area(read_image(path, partial(_colors, path), enough=AVERAGED * max(size)), *size)
 
     def get_alpha(self, image_idx: int) -> np.ndarray | None:

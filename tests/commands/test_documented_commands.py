@@ -32,8 +32,6 @@ SUBSTITUTES = {  # path in the documents: path in the test's folder
     "outputs/walk/run/config.yml": "run/config.yml",
     "outputs/.../nerfstudio_models": "run/nerfstudio_models",
     "outputs/...": "run",
-    "RUN_A/config.yml": "run/config.yml",
-    "RUN_B/config.yml": "other/config.yml",
 }
 RUN = {  # command of beags: flags appended to make it quick
     "extract": [],
@@ -120,8 +118,7 @@ def training_config(words: list[str]):
 def check_beags(words: list[str]) -> None:
     name = " ".join(words[:2]) if words[0] == "masks" else words[0]
     if name in RUN and "plane" not in words:  # the clouds of the test's run stand on nothing
-        sized = {"--camera-path", "--underlay"} & set(words)  # These have sizes of their own.
-        cli.main([*words, *([] if sized else RUN[name])])
+        cli.main([*words, *([] if "--camera-path" in words else RUN[name])])  # a path has a size of its own
         return
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
     parsed_by_tyro(cli.all_commands(words), words, config=config)

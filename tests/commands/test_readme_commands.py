@@ -62,7 +62,7 @@ STARTED = ("beags sample", "beags resume RUN")
 ELSEWHERE = {
     "ns-train <preset> --data X": "the two lines of ns-train are run",
     "beags export --load-config C --all [--format ply glb html]": "a line with --all is run",
-    "beags eval --load-config C [C ...]": "a line of it is run",
+    "beags eval --load-config C": "a line of it is run",
     "beags extract --load-config C [--object NAME ...] [--remove]": "a line of it is run",
     "beags render --load-config C [--object NAME ...]": "a line of it is run",
     "beags view RUN": "a line of it is run",

@@ -12,11 +12,10 @@ from known_masks import BOX, CLASSES, CUP, FLOOR, SETTINGS, SIZE, Squares, camer
 from scipy.ndimage import binary_erosion
 
 from beags_plugin.core.membership import Membership
-from beags_plugin.evaluation.metrics import METRICS, MaskMetrics, mask_metrics
+from beags_plugin.evaluation.metrics import MaskMetrics, mask_metrics
 from beags_plugin.evaluation.protocol import Protocol
-from beags_plugin.evaluation.records import EvalView, MaskRecord, ObjectMetrics, SceneMetrics, ViewRecord
-from beags_plugin.evaluation.report import RunMetrics, data_set
-from beags_plugin.evaluation.run_metrics import evaluate_scene, pooled_average
+from beags_plugin.evaluation.records import EvalView
+from beags_plugin.evaluation.run_metrics import evaluate_scene
 from beags_plugin.system.errors import UserError
 
 NO_FIGURES = MaskMetrics(None, None, None)
@@ -54,7 +53,7 @@ def test_the_band_has_the_width_asked_for(share, seed):
     assert found.iou == ratio(predicted, true)
 
 
-def test_who_is_resized():
+def test_the_prediction_is_resized():
     true, predicted = blobs(5)
     small = predicted[1::3, 1::3]  # the nearest pixels of a third: the middle ones
     ignored = np.zeros_like(true)
@@ -64,10 +63,6 @@ def test_who_is_resized():
     rows, columns = (np.arange(60) * 2 + 1) * 20 // 120, (np.arange(78) * 2 + 1) * 27 // 156
     large = small[rows][:, columns][:, 30:]
     assert by_prediction.iou == ratio(large, true[:, 30:78])
-    by_truth = mask_metrics(small[:, :26], true[:, :78], ignored[:, :78], Protocol(resize="truth"))
-    few = true[1::3, 1:78:3]
-    assert by_truth.iou == ratio(small[:, 10:26], few[:, 10:])
-    assert by_truth.acc == (small[:, 10:26] == few[:, 10:]).mean()
 
 
 def test_a_mask_that_is_empty_in_both_is_left_out_and_one_that_should_be_empty_counts_zero():
@@ -118,111 +113,6 @@ def test_what_no_photo_shows_is_scored_and_the_rest_stands_beside_it():
     assert cup.seen is not None and cup.seen.iou == predicted / known.sum().item()
 
 
-def records(seed: int, views: int, objects: int) -> list[MaskRecord]:
-    """Return random figures; some masks are missing and some have no IoU."""
-    generator, presence = np.random.default_rng(seed), np.random.default_rng(seed % 100)  # alike before and after
-    found = []
-    for view in range(views):
-        for class_id in range(1, objects + 1):
-            for kind in ("extracted", "rendered"):
-                if presence.random() < 0.75:
-                    acc, iou, biou, spill = generator.random(4).tolist()
-                    none = generator.random() < 0.2
-                    figures = MaskMetrics(acc, None if none else iou, biou, spill)
-                    found.append(MaskRecord(kind, class_id, view, "visible", figures))
-    return found
-
-
-def table(masks: list[MaskRecord], kind: str, metric: str, views: int, objects: int) -> np.ndarray:
-    """Return [views, objects], NaN where there is nothing."""
-    values = np.full((views, objects), np.nan)
-    for mask in masks:
-        value = getattr(mask.metrics, metric)
-        if mask.kind == kind and value is not None:
-            values[mask.view, mask.class_id - 1] = value
-    return values
-
-
-def averaged(values: np.ndarray, how: str) -> float:
-    if how == "objects":
-        values = np.nanmean(values, axis=0)
-    elif how == "views":
-        values = np.nanmean(values, axis=1)
-    return np.nanmean(values)
-
-
-@pytest.mark.parametrize("how", ["masks", "objects", "views"])
-@pytest.mark.parametrize("seed", range(3))
-def test_the_mean_of_a_scene(how, seed):
-    masks = records(seed, 7, 4)
-    for kind in ("extracted", "rendered"):
-        found = pooled_average({0: masks}, kind, Protocol(scene_average=how))
-        for metric in METRICS:
-            assert getattr(found, metric) == pytest.approx(averaged(table(masks, kind, metric, 7, 4), how))
-    assert pooled_average({0: []}, "extracted", Protocol(scene_average=how)) is None
-
-
-NOTHING = ObjectMetrics(None, None)
-
-
-def run(seed: int, views: int, objects: int, protocol: Protocol, before: bool = True) -> RunMetrics:
-    def stage(shift: int) -> SceneMetrics:
-        masks = records(seed + shift, views, objects)
-        generator = np.random.default_rng(seed + shift)
-        images = [ViewRecord(f"v{i}", *generator.uniform(0, 40, 2).tolist()) for i in range(views)]
-        kinds = tuple(pooled_average({0: masks}, kind, protocol) for kind in ("extracted", "rendered"))
-        psnr, ssim = (math.fsum(getattr(i, name) for i in images) / views for name in ("psnr", "ssim"))
-        return SceneMetrics(
-            ObjectMetrics(*kinds),
-            {c + 1: NOTHING for c in range(objects)},
-            psnr,
-            "visible",
-            ssim,
-            tuple(masks),
-            tuple(images),
-        )
-
-    return RunMetrics(f"s{seed}", "c", protocol, {}, stage(100) if before else None, stage(0))
-
-
-@pytest.mark.parametrize("how", ["masks", "objects", "views"])
-@pytest.mark.parametrize("over", ["scenes", "pooled"])
-def test_the_mean_of_a_data_set(how, over):
-    protocol = Protocol(scene_average=how, data_set_average=over)
-    sizes = [(3, 2), (8, 4), (5, 5)]
-    runs = [run(seed, *size, protocol) for seed, size in enumerate(sizes)]
-    found = data_set("three", runs)
-    for stage, shift in (("after", 0), ("before", 100)):
-        for kind in ("extracted", "rendered"):
-            for metric in METRICS:
-                tables = [table(records(seed + shift, *size), kind, metric, *size) for seed, size in enumerate(sizes)]
-                if over == "scenes":
-                    expected = np.mean([averaged(values, how) for values in tables])
-                else:  # one block of objects and views per scene
-                    whole = np.full((sum(v for v, _ in sizes), sum(o for _, o in sizes)), np.nan)
-                    row = column = 0
-                    for values in tables:
-                        whole[row : row + len(values), column : column + values.shape[1]] = values
-                        row, column = row + len(values), column + values.shape[1]
-                    expected = averaged(whole, how)
-                assert getattr(getattr(found.means[stage], kind), metric) == pytest.approx(expected)
-        scenes = [getattr(one, stage) for one in runs]
-        ratios = [[view.psnr for view in one.views] for one in scenes]
-        expected = np.mean([np.mean(r) for r in ratios]) if over == "scenes" else np.mean(np.concatenate(ratios))
-        assert found.images["psnr"][stage] == pytest.approx(expected)
-    row = found.csv_rows()[-1]
-    assert row[:3] == ["three", "", "after"] and row[4] == found.means["after"].extracted.iou
-
-
-def test_a_former_state_that_some_scenes_lack_is_not_averaged():
-    protocol = Protocol()
-    found = data_set("two", [run(0, 3, 2, protocol), run(1, 3, 2, protocol, before=False)])
-    assert set(found.means) == {"after"} and found.images["psnr"]["before"] is None
-    assert found.to_json()["mean"]["extracted"]["before"] == dict.fromkeys(METRICS)
-    with pytest.raises(ValueError, match="one protocol"):
-        data_set("two", [run(0, 3, 2, protocol), run(1, 3, 2, Protocol(threshold=0.3))])
-
-
 @pytest.mark.parametrize(
     ("choice", "words"),
     [
@@ -230,8 +120,6 @@ def test_a_former_state_that_some_scenes_lack_is_not_averaged():
         (dict(threshold=math.nan), "threshold is nan"),
         (dict(band_share=0.0), "band_share is 0.0"),
         (dict(band_share=math.inf), "band_share is inf"),
-        (dict(resize="both"), "there is no value 'both' for resize: choose one of prediction, truth"),
-        (dict(scene_average="median"), "choose one of masks, objects, views"),
     ],
 )
 def test_choices_that_cannot_be(choice, words):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import asdict
 
 import numpy as np
 import pytest
 import torch
-from data_folders import HEIGHT, WIDTH, noise, write_image, write_transforms
+from data_folders import HEIGHT, WIDTH, write_image, write_transforms
 from PIL import Image
 from run_folders import discs, write_scene, write_trained
 from scipy.ndimage import binary_erosion
@@ -19,7 +18,6 @@ pytest.importorskip("nerfstudio")
 from distorted_views import BROWN, LARGE_H, LARGE_W, LENS, distort
 
 from beags_plugin.commands.cli import main
-from beags_plugin.evaluation.metrics import mask_metrics
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import IMAGE_FIGURES
 from beags_plugin.labels.class_ids import IGNORE
@@ -81,20 +79,24 @@ def test_the_figures_of_a_run_are_those_of_its_files(trained):
     assert run.before.mean.extracted != run.after.mean.extracted
 
 
-def test_the_json_says_everything(trained, tmp_path):
-    path, table = tmp_path / "new" / "a.json", tmp_path / "a.csv"
-    main(["eval", "--load-config", str(trained), "--json", str(path), "--csv", str(table), "--threshold", "0.4"])
-    content = json.loads(path.read_text(), parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
-    assert set(content) == {"data_set", "protocol", "mean", *IMAGE_FIGURES, "scenes"}
-    assert content["protocol"] == asdict(Protocol(threshold=0.4))
-    (scene,) = content["scenes"]
+def test_the_files_say_everything(trained, tmp_path, capsys):
+    path, picture = tmp_path / "new" / "a.json", tmp_path / "worst.png"
+    files = ["--json", str(path), "--picture", str(picture), "--worst", "2"]
+    main(["eval", "--load-config", str(trained), *files, "--threshold", "0.4"])
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "else visible masks, less the pixels where another object stands nearer; above 0.4; boundary" in printed
+    assert "worst: " in printed
+    with Image.open(picture) as image:
+        assert image.height > 2 * 258 and image.width > 6 * 240  # two lines; photo, before and after of both kinds
+    scene = json.loads(path.read_text(), parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    assert scene["protocol"] == asdict(Protocol(threshold=0.4))
     assert set(scene) == {
         "scene", "config", "protocol", "extracted_truth", "colors_fitted", "notes", "mean", *IMAGE_FIGURES, "objects",
         "worst", "masks", "views",
     }  # fmt: skip
     assert scene["extracted_truth"] == "both" and set(scene["objects"]) == {"cup", "box"}
     figures = {"before", "after"}
-    for row in (scene["mean"], *scene["objects"].values(), content["mean"]):
+    for row in (scene["mean"], *scene["objects"].values()):
         for kind in ("extracted", "rendered"):
             assert set(row[kind]) == figures
             assert all(0 <= row[kind][stage][metric] <= 1 for stage in figures for metric in ("acc", "iou", "biou"))
@@ -104,32 +106,6 @@ def test_the_json_says_everything(trained, tmp_path):
     ious = [m["after"]["iou"] for m in scene["masks"] if (m["kind"], m["object"]) == ("rendered", "box")]
     assert scene["objects"]["box"]["rendered"]["after"]["iou"] == pytest.approx(np.mean(ious))
     assert scene["psnr"]["after"] == pytest.approx(np.mean([view["psnr"]["after"] for view in scene["views"]]))
-    with table.open() as file:
-        rows = list(csv.DictReader(file))
-    assert [(r["scene"], r["object"], r["stage"]) for r in rows[:6:2]] == [
-        ("lab", "cup", "before"), ("lab", "", "before"), ("lab", "box", "after")
-    ]  # fmt: skip
-    assert float(rows[-1]["rendered_iou"]) == content["mean"]["rendered"]["after"]["iou"]
-
-
-def test_several_runs_are_a_data_set(trained, tmp_path, capsys):
-    other = write_trained(tmp_path / "second", write_scene(tmp_path / "other" / "lab"))
-    picture, path = tmp_path / "worst.png", tmp_path / "all.json"
-    arguments = ["--load-config", str(trained), str(other), "--data-set-name", "labs", "--worst", "2"]
-    main(["eval", *arguments, "--json", str(path), "--picture", str(picture), "--scene-average", "views"])
-    printed = capsys.readouterr().out
-    assert "labs" in printed and "lab (run)" in printed and "lab (second)" in printed
-    printed = " ".join(printed.split())
-    assert "else visible masks, less the pixels where another object stands nearer; above 0.5; boundary" in printed
-    assert "means over views, then over scenes." in printed and "worst: " in printed
-    content = json.loads(path.read_text())
-    assert [scene["scene"] for scene in content["scenes"]] == ["lab (run)", "lab (second)"]
-    assert [scene["extracted_truth"] for scene in content["scenes"]] == ["both", "visible"]
-    for stage in ("before", "after"):
-        means = [scene["mean"]["extracted"][stage]["biou"] for scene in content["scenes"]]
-        assert content["mean"]["extracted"][stage]["biou"] == pytest.approx(np.mean(means))
-    with Image.open(picture) as image:
-        assert image.height > 2 * 258 and image.width > 6 * 240  # two lines; photo, before and after of both kinds
 
 
 def test_a_base_without_classes_has_image_figures_only(tmp_path, capsys):
@@ -188,18 +164,12 @@ def test_truth_is_undistorted_like_the_photographs(tmp_path):
     for index in range(9):
         write_image(tmp_path / f"lab/images/v{index:02d}.png", np.zeros((LARGE_H, LARGE_W, 3), np.uint8))
     write_image(tmp_path / "lab/ground_truth/masks/v00.png", ids)
-    for kind in ("silhouettes", "removed_shown"):
-        write_image(tmp_path / f"lab/ground_truth/{kind}/cup/v00.png", np.uint8(255) * (ids == 1))
-    for place in ("images/v00.png", "ground_truth/removed/cup/v00.png"):
-        write_image(tmp_path / "lab" / place, noise(0, LARGE_W, LARGE_H))
+    write_image(tmp_path / "lab/ground_truth/silhouettes/cup/v00.png", np.uint8(255) * (ids == 1))
     view = EvaluatedRun(write_trained(tmp_path / "run", tmp_path / "lab")).views[0]
     assert view.visible is not None and view.silhouettes is not None
     height, width = view.visible.shape
     assert abs(height - 2 * view.camera.height) <= 1 and abs(width - 2 * view.camera.width) <= 1
     assert torch.equal(view.silhouettes[1], view.visible == 1)
-    assert view.removed_shown is not None and torch.equal(view.removed_shown[1], view.visible == 1)
-    assert view.image is not None and view.removed is not None and list(view.removed) == [1]
-    assert torch.equal(view.removed[1], view.image) and view.image.std() > 0.1
     offsets = []
     for number, (x, y) in enumerate(rays, 1):
         there = torch.nonzero(view.visible == number).double() + 0.5  # row, column
@@ -239,17 +209,6 @@ def test_photographs_with_alpha_stand_on_the_background_of_the_training(tmp_path
     assert torch.equal(BeagsModel._truth(model, opaque, random), BeagsModel.get_gt_img(model, opaque["image"]))
 
 
-def test_the_option_who_is_resized_reaches_the_files(trained):
-    run = evaluate_run(trained, Protocol(resize="truth"))
-    surfels, ids = discs()
-    truth = np.asarray(Image.open(trained.parents[1] / "lab/ground_truth/silhouettes/cup/v00.png")) > 0
-    alone = rendered(trained, surfels[ids == 1], 0).alpha.numpy() > 0.5
-    assert run.after.masks[0].metrics == mask_metrics(alone, truth, None, Protocol(resize="truth"))
-    assert run.after.masks[0].metrics.iou == pytest.approx(
-        (alone & truth[1::2, 1::2]).sum() / (alone | truth[1::2, 1::2]).sum()
-    )
-
-
 def test_grey_of_traced_truth_counts_nowhere(tmp_path):
     """Value 128 beside 0 and 255 alone, in silhouettes and in the masks of single objects."""
     data = write_scene(tmp_path / "lab")
@@ -276,11 +235,7 @@ def test_grey_of_traced_truth_counts_nowhere(tmp_path):
 def test_data_that_has_gone_and_truth_of_other_proportions_are_refused(tmp_path):
     data = write_scene(tmp_path / "lab", truth_factor=2)
     write_image(data / "ground_truth/masks/v08.png", np.zeros((2 * HEIGHT, WIDTH), np.uint8))
-    write_image(data / "ground_truth/removed/cup/v00.png", noise(0, WIDTH, 2 * HEIGHT))
     config = write_trained(tmp_path / "run", data)
-    with pytest.raises(UserError, match=r"the picture .*v00.png is 20x24 pixels but its image is 20x12"):
-        evaluate_run(config)
-    (data / "ground_truth/removed/cup/v00.png").unlink()
     with pytest.raises(UserError, match=r"the mask .*v08.png is 20x24 pixels but its image is 20x12"):
         evaluate_run(config)
     data.rename(tmp_path / "moved")

@@ -58,7 +58,6 @@ def test_an_error_map_has_a_code_for_each_kind_of_pixel():
     assert error_map(predicted, true, ignore).tolist() == [[RIGHT, WRONG, MISSED, 0, LEFT_OUT]]
     large = true.repeat_interleave(3, 0).repeat_interleave(3, 1)
     assert error_map(predicted, large, None).shape == (3, 15)
-    assert error_map(predicted, large, None, Protocol(resize="truth")).tolist() == [[RIGHT, WRONG, MISSED, 0, RIGHT]]
 
 
 def test_errors_are_painted_over_the_photograph():

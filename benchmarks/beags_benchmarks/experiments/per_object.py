@@ -32,7 +32,7 @@ def object_names(scene: TrialScene) -> list[str]:
 def merged(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Return the worker's results for single objects, by name, as one result.
 
-    Masks and removals of an object come from its own scene. Metrics of images are means over the scenes, seconds and
+    Masks of an object come from its own scene. Metrics of images are means over the scenes, seconds and
     steps are sums, memory is the largest value.
     """
     first = next(iter(results.values()))

@@ -123,7 +123,6 @@ def protocol_of(rows: Sequence[ResultRow]) -> str | None:
     return protocol_sentence(
         protocol,
         [row.truth for row in rows],
-        removal=any(row.figures["removal_psnr_after"] is not None for row in rows),
         shown=any(row.figures["shown_after"] is not None for row in rows),
         fitted=any(row.colors_fitted for row in rows),
     )

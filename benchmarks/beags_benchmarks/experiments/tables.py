@@ -21,9 +21,6 @@ _COLUMNS = (  # head, figure, digits, factor
     ("\nafter", "extracted_spill_after", 1, 100.0),
     ("rendered\nIoU", "rendered_iou_after", 1, 100.0),
     ("\nBIoU", "rendered_biou_after", 1, 100.0),
-    ("removal\nPSNR", "removal_psnr_after", 2, 1.0),
-    ("\nshown", "removal_psnr_shown_after", 2, 1.0),
-    ("\nremains", "removal_remains_after", 1, 100.0),
     ("PSNR, dB\nbefore", "psnr_before", 2, 1.0),
     ("\nafter", "psnr_after", 2, 1.0),
     ("fit, dB\nbefore", "psnr_fit_before", 2, 1.0),
@@ -76,11 +73,10 @@ def _table(experiment: Experiment, rows: Sequence[ResultRow], title: str) -> Tab
     relative = any(row.variant.sweep in experiment.relative_to_pixels for row in rows)
     masks = experiment.confidence and _any(rows, "mask_error_given")
     compared = experiment.reference is not None
-    columns = [column for column in _COLUMNS if "removal" not in column[1] or _any(rows, column[1])]
     heads = ["per 10^6\npixels"] if relative else []
     heads += ["wrong, %\ngiven", "mask pixels\nused"] if masks else []
     heads += ["BIoU error\nleft, %"] if compared else []
-    table = new_table(title, ["variant", *heads, *(head for head, *_ in columns)])
+    table = new_table(title, ["variant", *heads, *(head for head, *_ in _COLUMNS)])
     reference = find_reference(rows, experiment, rows[0].scene) if rows else None
     former = None
     for row in rows:
@@ -93,7 +89,7 @@ def _table(experiment: Experiment, rows: Sequence[ResultRow], title: str) -> Tab
             cells += [number(row.figures[f"mask_error_{kind}"], 2, 100.0) for kind in ("given", "used")]
         if compared:
             cells.append(number(error_left(row, reference), 1, 100.0))
-        table.add_row(Text(name), *cells, *(["failed"] if row.failed else _cells(row, columns)))
+        table.add_row(Text(name), *cells, *(["failed"] if row.failed else _cells(row)))
     return table
 
 
@@ -109,10 +105,10 @@ def per_million_pixels(row: ResultRow, experiment: Experiment) -> str:
     return f"{1e6 * row.variant.x / pixels:.3g}"
 
 
-def _cells(row: ResultRow, columns: Sequence[tuple[str, str, int, float]]) -> list[str]:
+def _cells(row: ResultRow) -> list[str]:
     prepare = sum(value for stage in STAGES[1:-1] if (value := row.figures[f"seconds {stage}"]) is not None)
     figures = {**row.figures, "prepare": prepare}
-    return [number(figures[name], digits, factor) for _, name, digits, factor in columns]
+    return [number(figures[name], digits, factor) for _, name, digits, factor in _COLUMNS]
 
 
 def paper_table(paper: PaperFigures, reference: str | None) -> Table:

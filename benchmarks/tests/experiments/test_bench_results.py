@@ -33,7 +33,6 @@ from beags_benchmarks.experiments.results import (
 from beags_benchmarks.experiments.run import TABLE_WIDTH, rows_of
 from beags_benchmarks.experiments.tables import memory_line, per_million_pixels, tables
 from beags_benchmarks.experiments.trials import VariantTrial, plan
-from beags_plugin.evaluation.metrics import RemovalMetrics
 from beags_plugin.evaluation.protocol import Protocol
 from beags_plugin.evaluation.records import FIGURES as METRICS
 from beags_plugin.evaluation.records import ObjectMetrics, SceneMetrics
@@ -132,8 +131,6 @@ def test_json_and_csv_hold_every_row_and_the_same_figures(rows, tmp_path, experi
         ("b", "mean"), ("b", "cup"), ("b", "box"), ("b", "mean"),
     ]  # fmt: skip
     assert read["rows"][1]["extracted_iou_after"] == pytest.approx(0.35)
-    assert read["rows"][0]["removal_ssim_after"] == pytest.approx(0.6)
-    assert read["means"][0]["removal_ssim_after"] == pytest.approx(0.5)
     assert read["rows"][-1]["failed"] == "k is 0."
     assert [mean["error_left"] for mean in read["means"]] == [1.0, pytest.approx(0.2)]
     with open(tmp_path / "deep/r.csv", newline="") as file:
@@ -145,17 +142,14 @@ def test_json_and_csv_hold_every_row_and_the_same_figures(rows, tmp_path, experi
 
 
 def test_the_protocol_is_worded_as_by_beags_eval(rows):
-    removal = RemovalMetrics(20.0, None, None, 0.9, 0.1)
-    scene = SceneMetrics(ObjectMetrics(None, None, None, removal), {}, 30.0, "silhouette", shown=0.75)
+    scene = SceneMetrics(ObjectMetrics(None, None), {}, 30.0, "silhouette", shown=0.75)
     run = RunMetrics("a", "c", Protocol(band_share=0.03), {}, None, scene)
-    assert protocol_of(rows) == protocol_line([run]) and "3 % of the diagonal" in protocol_line([run])
-    gone = dict.fromkeys((f"removal_{metric}_after" for metric in METRICS["removal"]), None)
-    plain = [dataclasses.replace(row, figures={**row.figures, "shown_after": None, **gone}) for row in rows]
-    bare = dataclasses.replace(scene, mean=ObjectMetrics(None, None), shown=None)
-    assert protocol_of(plain) == protocol_line([dataclasses.replace(run, after=bare)])
+    assert protocol_of(rows) == protocol_line(run) and "3 % of the diagonal" in protocol_line(run)
+    plain = [dataclasses.replace(row, figures={**row.figures, "shown_after": None}) for row in rows]
+    assert protocol_of(plain) == protocol_line(dataclasses.replace(run, after=dataclasses.replace(scene, shown=None)))
     fitted = [dataclasses.replace(row, colors_fitted=row.scene == "a") for row in rows]
     exposed = dataclasses.replace(run, after=dataclasses.replace(scene, colors_fitted=True))
-    assert protocol_of(fitted) == protocol_line([run, exposed]) != protocol_line([run])
+    assert protocol_of(fitted) == protocol_line(exposed) != protocol_line(run)
     mixed = [dataclasses.replace(row, truth="visible" if row.scene == "b" else row.truth) for row in rows]
     assert "against whole occlusion-free silhouettes, else visible masks" in protocol_of(mixed)
     assert protocol_of(rows[3:]) is None  # it failed
@@ -169,15 +163,10 @@ def test_tables_list_failures_and_mark_the_papers_figures(rows):
         console.print(table)
     text = console.file.getvalue()
     assert "failed: k = 8 on b: k is 0." in text and "k = 8 (1 of 2 scenes)" in text
-    assert "removal" in text and protocol_of(rows) in " ".join(text.split())
+    assert protocol_of(rows) in " ".join(text.split())
     assert "29.00 30.00 29.50 30.25 31.00 31.25 75.0" in " ".join(text.split())  # PSNR, after the fit, shown, share
     assert text.index("spill,") < text.index("rendered") and "…" not in text
-    assert " -10.0 40.0 50.0 50.0 50.0 0.50" in " ".join(text.split())  # lost, then spill before and after, rendered
-    of_removal = [f"removal_{metric}_after" for metric in METRICS["removal"]]
-    real = [dataclasses.replace(r, figures={**r.figures, **dict.fromkeys(of_removal)}) for r in rows]  # fmt: skip
-    for table in tables(load_experiment("ablation"), real):
-        console.print(table)
-    assert "emov" not in console.file.getvalue()[len(text) :]
+    assert " -10.0 40.0 50.0 50.0 50.0 29.00" in " ".join(text.split())  # lost, then spill before and after, rendered
     assert "the paper's figures, not ours" in text and "92.0 / 85.8 (52)" in text  # (100 - 85.8) / (100 - 72.8)
 
 

@@ -106,9 +106,7 @@ def test_exposure_changes_the_photos_and_nothing_else(folders):
     before, now = files(alike), files(exposed)
     assert before.keys() == now.keys()
     changed = {path for path in before if before[path] != now[path]}
-    photos = set(files(alike, "images", "ground_truth/removed/"))
-    assert changed - {"sample.json"} <= photos
-    assert changed >= set(files(alike, "images"))
+    assert changed - {"sample.json"} == set(files(alike, "images"))
     assert points_of(alike)["c"].std() > 5  # all bytes of the points are alike: their colours are of the mean exposure
     options = json.loads((exposed / "sample.json").read_text())
     assert (options["exposure"], options["white_balance"], options["moved"]) == (1.5, 0.5, 0)
@@ -121,20 +119,12 @@ def shown_stops(before, now):
     return np.log2([np.median(now[..., c][clear[..., c]] / before[..., c][clear[..., c]]) for c in range(3)])
 
 
-def test_photos_and_pictures_without_an_object_show_the_gains(folders):
+def test_photos_show_the_gains(folders):
     alike, exposed = folders["alike"], folders["exposed"]
     gains = photo_gains(*splits(alike), TINY.seed, 1.5, 0.5)
     for path in sorted((alike / "images").iterdir()):
         stops = shown_stops(grey(path), grey(exposed / "images" / path.name))
         assert np.allclose(stops, np.log2(gains[path.stem]), atol=0.05), path
-    compared = 0
-    for path in sorted((alike / "ground_truth/removed").rglob("*.png")):
-        silhouette = grey(alike / "ground_truth/silhouettes" / path.parent.name / path.name) > 0
-        pictures = [grey(folder / path.relative_to(alike))[silhouette] for folder in (alike, exposed)]
-        if silhouette.sum() > 30 and (pictures[0].min(axis=1) > 60).sum() > 20:
-            assert np.allclose(shown_stops(*pictures), np.log2(gains[path.stem]), atol=0.15), path
-            compared += 1
-    assert compared > 3
 
 
 def test_a_visitor_stands_in_some_training_photos_and_is_background(folders):
@@ -156,7 +146,7 @@ def test_a_visitor_stands_in_some_training_photos_and_is_background(folders):
             assert (moved / f"images/{stem}.png").read_bytes() == (alike / f"images/{stem}.png").read_bytes()
     assert len(visited) == 2
     held_out = tuple(f"{kind}/{stem}.png" for kind in ("images", "masks", "ground_truth/masks") for stem in test)
-    kinds = (*held_out, "ground_truth/silhouettes", "ground_truth/removed/")
+    kinds = (*held_out, "ground_truth/silhouettes")
     assert files(alike, *kinds) == files(moved, *kinds)
 
 

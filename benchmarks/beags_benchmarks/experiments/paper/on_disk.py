@@ -175,8 +175,8 @@ def _truth_notes(data_set: PaperDataSet, name: str, folder: Path, held_out: Mapp
     traced = {each for each, files in truth["silhouettes"].items() if any(files)}
     if lacking := [each for each in wanted if each not in traced]:
         notes.append(
-            f"silhouettes of {_listed(lacking)} belong in {folder / TRUTH / 'silhouettes'}/<object>/<photo>.png "
-            "(beags render --underlay): without, extracted objects are compared with visible masks"
+            f"silhouettes of {_listed(lacking)} belong in {folder / TRUTH / 'silhouettes'}/<object>/<photo>.png, white "
+            "on black: without, extracted objects are compared with visible masks"
         )
     return notes
 
