@@ -225,5 +225,5 @@ def _has_masks(data: Path) -> bool:
     from beags_plugin.views.scene_data import SceneData
 
     parser = SceneData(DataOptions(data=data))
-    masks, folder, _ = parser.mask_files(*parser.posed_views())
+    masks, folder = parser.mask_files(*parser.posed_views())
     return any(masks) or any(folder.glob("**/*.png"))  # Training reports wrong names of masks.

@@ -8,11 +8,9 @@ LAYOUTS = Registry(
     {
         "3dovs": "beags_plugin.data.layouts.three_d_ovs:ThreeDOvs",
         "colmap": "beags_plugin.data.layouts.colmap:Colmap",
-        "dtu": "beags_plugin.data.layouts.dtu:Dtu",
         "lerf-mask": "beags_plugin.data.layouts.lerf_mask:LerfMask",
         "llff": "beags_plugin.data.layouts.llff:Llff",
         "mipnerf360": "beags_plugin.data.layouts.mipnerf360:MipNerf360",
         "nerfstudio": "beags_plugin.data.layouts.nerfstudio:NerfstudioLayout",
-        "spin-nerf": "beags_plugin.data.layouts.spin_nerf:SpinNerf",
     },
 )

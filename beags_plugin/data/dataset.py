@@ -5,15 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from beags_plugin.system.errors import UserError, meant
-
-MaskKind = Literal["ids", "binary"]
-"""Images of class ids, or binary masks of one object (``labels.classes.read_object_mask``)."""
 
 
 @dataclass(frozen=True)
@@ -67,12 +63,11 @@ class Split:
     """Protocol of the held-out views.
 
     held_out: stems of images that the protocol names. every: whether every ``eval_interval``-th view in the order of
-    names is held out too. left_out: stems of images for neither training nor evaluation.
+    names is held out too.
     """
 
     held_out: tuple[str, ...] = ()
     every: bool = True
-    left_out: tuple[str, ...] = ()
 
 
 FilesOfObject = Mapping[str, Path]
@@ -84,13 +79,12 @@ class Dataset:
     """A data set of one scene as its layout describes it.
 
     layout: title of the layout. root: folder of the data set.
-    masks, mask_kind: folder of the training masks <stem>.png, which may be missing, and their kind.
-    mask_files: stem of an image to its mask if masks have other names, or None.
+    masks: folder of the training masks <stem>.png, images of class ids; it may be missing.
     class_names: id to name, or None. class_names_file: their file, for messages.
-    visible, silhouettes: object name to exact masks for evaluation, of the visible part and of the whole object.
+    visible: object name to exact masks of its visible part, for evaluation.
     seed_points: .ply, or COLMAP's points3D.bin or .txt, in the frame of a ``PoseTable``; None if the poses bring them.
     downscale: factor by which the images' sides are divided by default, to the size that the data set's papers use.
-    notes: sentences for the user. size_note: a sentence on the size of the images if the layout chose it, or "".
+    size_note: a sentence on the size of the images if the layout chose it, or "".
     """
 
     layout: str
@@ -98,15 +92,11 @@ class Dataset:
     poses: Poses
     split: Split = Split()
     masks: Path = Path("masks")
-    mask_kind: MaskKind = "ids"
-    mask_files: Mapping[str, Path] | None = None
     class_names: Mapping[int, str] | None = None
     class_names_file: Path | None = None
     visible: Mapping[str, FilesOfObject] = field(default_factory=dict)
-    silhouettes: Mapping[str, FilesOfObject] = field(default_factory=dict)
     seed_points: Path | None = None
     downscale: float = 1.0
-    notes: tuple[str, ...] = ()
     size_note: str = ""
 
 
@@ -116,19 +106,16 @@ def split_views(
     """Return the indices of the training and of the evaluation views; without held-out views, all serve as both.
 
     names: for each view, in the order of names, its names: that of its file and that in the poses. interval: of
-    ``Split.every``, counted from the first view that is not left out; 0 for none. held_out: names from the user, in
-    addition to the protocol's. Raises ``UserError`` if a name of ``held_out`` does not exist, or no training view is
-    left.
+    ``Split.every``; 0 for none. held_out: names from the user, in addition to the protocol's. Raises ``UserError`` if a
+    name of ``held_out`` does not exist, or no training view is left.
     """
     known = set().union(*names)
     if unknown := sorted(set(held_out) - known):
         near = meant(unknown[0], known)
         raise UserError(f"held_out names {unknown[0]!r}, but no image has that stem{near}: correct the name.")
-    used = [index for index, own in enumerate(names) if own.isdisjoint(split.left_out)]
-    out = set(used[::interval]) if split.every and interval > 0 else set()
-    out |= {index for index in used if not names[index].isdisjoint(split.held_out)}
-    out |= {index for index, own in enumerate(names) if not own.isdisjoint(held_out)}  # Views left out count as well.
-    train = [index for index in used if index not in out]
+    out = set(range(0, len(names), interval)) if split.every and interval > 0 else set()
+    out |= {index for index, own in enumerate(names) if not own.isdisjoint({*split.held_out, *held_out})}
+    train = [index for index in range(len(names)) if index not in out]
     if not train:
-        raise UserError(f"all {len(used)} views are held out for evaluation: add views or change eval_interval.")
+        raise UserError(f"all {len(names)} views are held out for evaluation: add views or change eval_interval.")
     return train, sorted(out) or train

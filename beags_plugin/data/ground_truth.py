@@ -42,7 +42,7 @@ def find_ground_truth(dataset: Dataset, folder: Path, images: Sequence[Path], im
     ``folder`` holds masks/<stem>.png, and <kind>/<object>/<stem>.png for the other kinds; these take precedence over
     files of the layout.
     """
-    if not (folder.is_dir() or dataset.visible or dataset.silhouettes):
+    if not (folder.is_dir() or dataset.visible):
         return None
 
     def per_object(kind: str, own: Mapping[str, FilesOfObject]) -> dict[str, FilesPerView]:
@@ -53,8 +53,7 @@ def find_ground_truth(dataset: Dataset, folder: Path, images: Sequence[Path], im
             files_of[path.name] = [mask or other for mask, other in zip(better, former, strict=True)]
         return files_of
 
-    own = {"visible": dataset.visible, "silhouettes": dataset.silhouettes}
-    of_objects = {kind: per_object(kind, own.get(kind, {})) for kind in OF_OBJECTS}
+    of_objects = {kind: per_object(kind, dataset.visible if kind == "visible" else {}) for kind in OF_OBJECTS}
     return cast(GroundTruth, {"masks": files_of_views(folder / "masks", images, images_root), **of_objects})
 
 

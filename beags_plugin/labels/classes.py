@@ -114,11 +114,6 @@ def _is_picture(values: np.ndarray) -> bool:
     return bool(counts.sum() > MOST_SHADED * values.size and np.count_nonzero(counts) > LEAST_SHADES)
 
 
-def read_mask(path: Path | str, kind: str, ignore_ids: Iterable[int] = ()) -> np.ndarray:
-    """Read the class ids of an id image (kind "ids"), or 1, 0 or IGNORE of a "binary" mask, [H, W] uint16."""
-    return read_object_mask(path) if kind == "binary" else read_id_mask(path, ignore_ids)
-
-
 def _read_pixels(path: Path | str) -> tuple[str, np.ndarray]:
     """Read Pillow's mode and the values of a lossless image."""
     try:

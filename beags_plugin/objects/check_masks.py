@@ -173,7 +173,7 @@ def _files(config: DataOptions) -> tuple[Dataset, PosedViews, MaskFiles]:
     scene, views = parser.posed_views()
     sizes = [image_size(path) for path in views.images]
     parser.fit_cameras(views, sizes)
-    masks, folder, kind = parser.mask_files(scene, views)
+    masks, folder = parser.mask_files(scene, views)
     parser.check_folder(folder)
     trained = set(parser.views_of_split(views, "train"))
     parser.views_of_split(views, "val")  # raises if there is none, as training would
@@ -184,7 +184,6 @@ def _files(config: DataOptions) -> tuple[Dataset, PosedViews, MaskFiles]:
         sizes,
         masks,
         folder,
-        kind,
         tuple(config.ignore_ids),
         [view in trained for view in range(len(masks))],
         names,

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from beags_plugin.core.cameras import Camera
 from beags_plugin.labels.class_ids import resize_nearest
-from beags_plugin.labels.classes import read_id_mask, read_mask
+from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.occupancy.grid import VisibilityGrid
 from beags_plugin.runs.layout import PREPARED
 from beags_plugin.system.errors import UserError
@@ -108,12 +108,10 @@ def training_masks(config: RunConfig) -> list[TrainingMasks]:
     for index, (name, photo) in enumerate(zip(unique_names(outputs.images), outputs.images, strict=True)):
         used = read_id_mask(prepared / "masks" / f"{name}.png")
 
-        def sized(path: Path | None, kind: str, like: np.ndarray = used) -> np.ndarray | None:
-            if path is None:
-                return None
-            return resize_nearest(read_mask(path, kind, metadata["ignore_ids"]), *like.shape)
+        def sized(path: Path | None, like: np.ndarray = used) -> np.ndarray | None:
+            return None if path is None else resize_nearest(read_id_mask(path, metadata["ignore_ids"]), *like.shape)
 
-        given = sized(metadata["mask_filenames"][index], metadata["mask_kind"])
+        given = sized(metadata["mask_filenames"][index])
         confidence = prepared / "confidence" / f"{name}.png"
-        views.append(TrainingMasks(name, photo, given, used, sized(exact[index], "ids"), confidence))
+        views.append(TrainingMasks(name, photo, given, used, sized(exact[index]), confidence))
     return views

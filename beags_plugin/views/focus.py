@@ -16,7 +16,7 @@ from rich.progress import track
 from torch import Tensor
 
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE, count_ids
-from beags_plugin.labels.classes import read_mask
+from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.progress import say
 from beags_plugin.views.close_ups import MOST_BYTES, CloseUps, kept_pixels, kept_size, read_close_ups
@@ -161,7 +161,7 @@ def _lost(files: PhotoFiles, found: set[int]) -> str | None:
     lost: set[int] = set()
     for mask in track(metadata["mask_filenames"] if missing else [], "Looking for small objects", transient=True):
         if mask is not None and not missing <= lost:
-            ids = read_mask(mask, metadata["mask_kind"], metadata["ignore_ids"])
+            ids = read_id_mask(mask, metadata["ignore_ids"])
             lost |= missing & set(np.flatnonzero(np.bincount(ids.ravel())).tolist())
     if not lost:
         return None

@@ -15,7 +15,7 @@ from beags_plugin.data.files import image_size, same_proportions
 from beags_plugin.data.ground_truth import GroundTruth
 from beags_plugin.evaluation.records import EvalView, FullPhoto
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
-from beags_plugin.labels.classes import read_mask, read_object_mask
+from beags_plugin.labels.classes import read_id_mask, read_object_mask
 from beags_plugin.system.errors import UserError
 from beags_plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.views.photo_files import Box
@@ -40,7 +40,6 @@ class HeldOutViews(Sequence[EvalView]):
         self.background = background.cpu()
         self._views = self.manager.views("test")
         self._metadata = self.manager.eval_dataset.metadata
-        self._kind: str = self._metadata["mask_kind"]
 
     def __len__(self) -> int:
         return len(self._views)
@@ -85,10 +84,9 @@ class HeldOutViews(Sequence[EvalView]):
         # If objects were labelled one by one, a view without such masks has no ground truth, whatever its own mask.
         trusted = self.no_truth is None and not truth["visible"]
         own = self._metadata["mask_filenames"][index] if trusted else None
-        file, kind = (exact, "ids") if exact else (own, self._kind)
         visible = None
-        if file is not None:
-            ids = read_mask(file, kind, self._metadata["ignore_ids"])
+        if (file := exact or own) is not None:
+            ids = read_id_mask(file, self._metadata["ignore_ids"])
             visible = torch.from_numpy(self._straight(file, ids, index).astype(np.int32))
         silhouettes, unknown_silhouettes = self._per_object(truth["silhouettes"], index)
         visible_objects, unknown_visible = self._per_object(truth["visible"], index)

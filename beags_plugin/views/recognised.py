@@ -37,7 +37,7 @@ def recognised(parser: Any, scene: Dataset, views: PosedViews, metadata: Mapping
     )
     if scene.size_note and parser.config.downscale_factor in (None, scene.downscale):
         notes.append(scene.size_note)
-    return [line, *views.notes, *notes, *scene.notes]
+    return [line, *views.notes, *notes]
 
 
 def _split_in_words(parser: Any, views: PosedViews, scene: Dataset) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from beags_plugin.data.dataset import Dataset, MaskKind, split_views
+from beags_plugin.data.dataset import Dataset, split_views
 from beags_plugin.data.files import check_mask_files, check_same_size, files_of_views, image_size
 from beags_plugin.data.ground_truth import find_ground_truth, of_views, stray_note
 from beags_plugin.data.layout import read_dataset
@@ -36,7 +36,7 @@ class SplitData:
 
     metadata: ``points3D_xyz`` [P, 3] float32 in the world of the cameras, ``points3D_rgb`` [P, 3] uint8,
     ``points3D_random`` (whether the points are sampled), ``classes`` (id to name), ``mask_filenames`` (a path or None
-    for each view), ``mask_kind`` (``data.dataset.MaskKind``), ``no_truth`` (the file ``labels.classes.NO_TRUTH``, or
+    for each view), ``no_truth`` (the file ``labels.classes.NO_TRUTH``, or
     None), ``ignore_ids``, ``ground_truth`` (``data.ground_truth.GroundTruth`` or None), ``stray_truth`` (a sentence on
     exact masks of no view, or None).
     """
@@ -82,14 +82,10 @@ class SceneData:
             tracks = seeds_seen(self._scene.root, self._metadata["points3D_xyz"].double().numpy(), views)
         return [tracks[view] for view in self.views_of_split(views, split)] if tracks else []
 
-    def mask_files(self, scene: Dataset, views: PosedViews) -> tuple[list[Path | None], Path, MaskKind]:
-        """Return the mask file of each view or None, the folder of the masks, and their kind."""
-        folder, kind = scene.root / scene.masks, scene.mask_kind
-        if self.config.masks_path is not None:
-            folder, kind = scene.root / self.config.masks_path, "ids"
-        elif scene.mask_files is not None:
-            return [scene.mask_files.get(image.stem) for image in views.images], folder, kind
-        return files_of_views(folder, views.images, images_root(scene)), folder, kind
+    def mask_files(self, scene: Dataset, views: PosedViews) -> tuple[list[Path | None], Path]:
+        """Return the mask file of each view or None, and the folder of the masks."""
+        folder = scene.root / (self.config.masks_path or scene.masks)
+        return files_of_views(folder, views.images, images_root(scene)), folder
 
     def split(self, split: str) -> SplitData:
         """Return the views of "train", "val" or "test"; all splits share one reading of the poses."""
@@ -116,11 +112,11 @@ class SceneData:
         config = self.config
         sizes = [image_size(path) for path in views.images]
         self.fit_cameras(views, sizes)
-        masks, folder, kind = self.mask_files(scene, views)
+        masks, folder = self.mask_files(scene, views)
         if not any(masks):
             check_mask_files(folder, views.images)
         check_same_size(masks, sizes, views.images)
-        present = [mask for mask in masks if mask is not None and kind == "ids"]
+        present = [mask for mask in masks if mask is not None]
         truth = (scene.root / config.ground_truth_path, views.images, images_root(scene))
         classes_file = scene.root / config.classes_path
         self.check_folder(folder)
@@ -131,7 +127,6 @@ class SceneData:
             **starting_points(scene, views, config.num_random_points),
             "classes": read_class_names(classes_file, present, config.ignore_ids, *known),
             "mask_filenames": masks,
-            "mask_kind": kind,
             "no_truth": folder / NO_TRUTH if (folder / NO_TRUTH).exists() else None,
             "ignore_ids": tuple(config.ignore_ids),
             "ground_truth": find_ground_truth(scene, *truth) if self._truth else None,

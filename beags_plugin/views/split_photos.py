@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from beags_plugin.labels.class_ids import IGNORE, resize_nearest
-from beags_plugin.labels.classes import read_mask
+from beags_plugin.labels.classes import read_id_mask
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.images import read_image
 from beags_plugin.views.cameras import downscaled_size, resize_cameras
@@ -76,7 +76,7 @@ class SplitPhotos:
         path = self.metadata["mask_filenames"][image_idx]
         if path is None:
             return np.full((height, width), IGNORE, np.uint16)
-        ids = read_mask(path, self.metadata["mask_kind"], self.metadata["ignore_ids"])
+        ids = read_id_mask(path, self.metadata["ignore_ids"])
         return resize_nearest(ids, height, width)
 
 

@@ -108,7 +108,6 @@ SENTENCES = {
     "{tmp}/file/x.png cannot be written (File exists): choose another place.",
     # eval
     "eval --load-config {tmp}/absent.yml": NO_FILE,
-    f"eval --load-config {RUN} {RUN}": "{tmp}/run/config.yml is given twice: name each run once.",
     f"eval --load-config {RUN} --threshold 2": "threshold is 2.0: give a number from 0 to below 1.",
     f"eval --load-config {RUN} --picture a.txt": "the picture a.txt is no .png or .jpg: give it such a name.",
     f"eval --load-config {RUN} --json {{tmp}}/lab": "{tmp}/lab is a folder: name the file to write.",
@@ -120,7 +119,6 @@ SENTENCES = {
     "bench file ablatoin --output {tmp}/bench": "there is no experiment 'ablatoin' (did you mean ablation?): "
     "choose one of ablation, classes, compare, compare-consistent, masks, presets, "
     "sensitivity, or name a .toml file.",
-    "bench truth --data {tmp}/lab": "give one of --nvos and --spin-nerf the folder of the downloaded masks.",
     # doctor
     "doctor --json {tmp}/file/x.json": "{tmp}/file/x.json cannot be written (File exists): choose another place.",
 }
@@ -178,7 +176,7 @@ def test_subcommands_read_alike():
         for field in dataclasses.fields(command):
             kinds.setdefault(field.name, set()).add(str(field.type))
     assert kinds["json"] == {"Path | None"} and kinds["object"] == {"tuple[str, ...]"}
-    assert kinds["load_config"] == {"Path", "tuple[Path, ...]"}  # eval takes several
+    assert kinds["load_config"] == {"Path"}
     assert kinds["output"] <= {"Annotated[Path, OUTPUT]", "Annotated[Path | None, OUTPUT]"}
     assert kinds["objects"] == {"int"}  # The demo takes a number here; names are given by object.
     assert not {"run", "config", "config_path", "out", "out_dir"} & set(kinds)

@@ -13,12 +13,10 @@ from layout_folders import (
     ids,
     opencv_matrices,
     write_3dovs,
-    write_dtu,
     write_lerf_mask,
     write_llff,
     write_mipnerf360,
     write_poses_bounds,
-    write_spin_nerf,
 )
 from parsed_views import AS_GIVEN, POINT, moved, names, parse, pixel, real, title
 
@@ -105,12 +103,12 @@ def test_nerfstudio_comes_before_colmap(tmp_path):
 
 
 def test_two_layouts_in_one_folder_are_refused(tmp_path):
-    write_dtu(tmp_path)
-    write_poses_bounds(tmp_path, [f"{index:06d}.png" for index in range(9)], 1)
-    with pytest.raises(UserError, match=r"cameras_sphere\.npz \(dtu\) and poses_bounds\.npy \(llff\): choose one"):
+    write_lerf_mask(tmp_path)
+    write_poses_bounds(tmp_path, [f"{index:06d}.png" for index in range(6)], 1)
+    with pytest.raises(UserError, match=r"test_mask \(lerf-mask\) and poses_bounds\.npy \(llff\): choose one"):
         parse(tmp_path)
-    assert title(tmp_path, "dtu") == "DTU"
-    assert len(parse(tmp_path, layout="dtu").image_filenames) == 7
+    assert title(tmp_path, "lerf-mask") == "LERF-Mask"
+    assert len(parse(tmp_path, layout="lerf-mask").image_filenames) == 4
 
 
 def test_an_unknown_folder_or_layout_is_refused(tmp_path):
@@ -118,8 +116,8 @@ def test_an_unknown_folder_or_layout_is_refused(tmp_path):
         parse(tmp_path)
     with pytest.raises(UserError, match=r"there is no layout 'llf' .did you mean llff.*: choose one of 3dovs, colmap"):
         parse(tmp_path, layout="llf")
-    with pytest.raises(UserError, match=r"holds no cameras_sphere\.npz, which the layout dtu needs"):
-        parse(tmp_path, layout="dtu")
+    with pytest.raises(UserError, match=r"holds no segmentations/classes\.txt, which the layout 3dovs needs"):
+        parse(tmp_path, layout="3dovs")
 
 
 class Turntable(Layout):
@@ -154,7 +152,6 @@ def test_another_package_can_add_a_layout(tmp_path, monkeypatch):
 
 COLMAP_K = [[FX, 0, CX], [0, FY, CY], [0, 0, 1]]
 POSES_BOUNDS_K = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
-DTU_K = [[FX, 0, CX + 0.5], [0, FY, CY + 0.5], [0, 0, 1]]  # its pixel centres are whole numbers
 # layout: how its fixture is written, the options to read it with, K and size of the images that are read
 EVERY = {
     "nerfstudio": (write_transforms, {}, COLMAP_K, 1.0),
@@ -163,8 +160,6 @@ EVERY = {
     "llff": (write_llff, {"images_path": Path("images_4")}, POSES_BOUNDS_K, 1.0),
     "lerf-mask": (write_lerf_mask, {}, COLMAP_K, 1.0),
     "3dovs": (write_3dovs, {}, POSES_BOUNDS_K, 1.0),
-    "spin-nerf": (write_spin_nerf, {}, COLMAP_K, 0.25),
-    "dtu": (write_dtu, {}, DTU_K, 1.0),
 }
 
 
@@ -188,9 +183,6 @@ def test_intrinsics_follow_the_size_of_the_images(tmp_path, layout):
     scale = np.diag([factor, factor, 1.0])
     np.testing.assert_allclose(camera_from_nerfstudio(before.cameras, 1).K.numpy(), scale @ K, rtol=1e-5)
     seen = pixel(before, 1, moved(before, POINT))
-    if layout == "dtu":  # its poses do not say how large their images are: larger ones lie in a folder of their own
-        shutil.copytree(tmp_path / "image", tmp_path / "copies")
-        options = {"images_path": Path("copies")}
     for split in ("train", "test"):
         outputs = parse(tmp_path, split, layout=layout, **options)
         for path in (*outputs.image_filenames, *outputs.metadata["mask_filenames"]):
@@ -209,7 +201,7 @@ def test_ground_truth_has_a_folder_for_what_is_seen_and_one_for_what_is_hidden(t
     write(tmp_path)
     stem = names(parse(tmp_path, "test", layout=layout, **options))[0]
     folder = tmp_path / "ground_truth"
-    files = {kind: folder / kind / f"thing/{stem}.png" for kind in ("visible", "silhouettes", "seen", "removed")}
+    files = {kind: folder / kind / f"thing/{stem}.png" for kind in ("visible", "silhouettes", "seen")}
     for path in (*files.values(), folder / f"masks/{stem}.png"):
         write_image(path, ids(1))
     truth = parse(tmp_path, "test", layout=layout, **options).metadata["ground_truth"]

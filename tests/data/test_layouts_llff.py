@@ -1,4 +1,4 @@
-"""LLFF: scaled images, poses and points of either file, and the views that NVOS holds out."""
+"""LLFF: scaled images, poses and points of either file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from data_folders import CX, CY, FX, FY, HEIGHT, WIDTH, noise, write_colmap, write_image
+from data_folders import CX, CY, FX, FY, HEIGHT, WIDTH, write_colmap
 from layout_folders import FOCAL, opencv_matrices, write_copies, write_llff, write_poses_bounds
 from parsed_views import AS_GIVEN, POINT, moved, names, parse, pixel, real, title
 
@@ -26,7 +26,7 @@ def test_llff_scales_the_intrinsics_to_the_images_and_turns_the_axes(tmp_path):
         if index != 1:
             x, y, z = (matrix @ [*POINT, 1.0])[:3]
             expected = [WIDTH / 2 + FOCAL * x / z, HEIGHT / 2 + FOCAL * y / z]
-            np.testing.assert_allclose(pixel(outputs, index - (index > 1), POINT), expected, atol=1e-4)
+            np.testing.assert_allclose(pixel(outputs, index, POINT), expected, atol=1e-4)
     normalised = parse(root, images_path=Path("images_4"), eval_interval=0)
     expected = pixel(outputs, 0, POINT)
     np.testing.assert_allclose(pixel(normalised, 0, moved(normalised, POINT)), expected, atol=1e-3)
@@ -53,21 +53,6 @@ def test_images_of_llff_that_are_narrower_than_the_papers_are_said_to_be(tmp_pat
     assert f"The images of images_4 are used {words} (other sizes: " in " ".join(capsys.readouterr().out.split())
 
 
-@pytest.mark.parametrize("known_by", ["images", "names", "copies"])
-def test_llff_holds_out_the_view_that_nvos_scores(tmp_path, known_by, capsys):
-    root = tmp_path / "fern"
-    stems = write_llff(root, originals=known_by == "images")
-    if known_by == "names":
-        (root / "original_names.txt").write_text("image001.png IMG_4026.JPG\nimage003.png IMG_4027.JPG\n")
-    target = {"images": ["image001"], "names": ["image003"], "copies": []}[known_by]
-    outputs = parse(root, "test", images_path=Path("images_4"))
-    assert names(outputs) == sorted(["image000", "image008", *target])
-    assert set(names(parse(root, images_path=Path("images_4")))) == set(stems) - set(names(outputs))
-    said = " ".join(capsys.readouterr().out.split())
-    assert ("holds out IMG_4027, but no image has that name" in said) == (not target)
-    assert not target or f"({2 + len(target)} held out, {target[0]} by protocol)" in said
-
-
 def test_llff_with_colmap_pairs_renamed_copies_in_order(tmp_path):
     root = tmp_path / "fern"
     originals = [f"IMG_{4026 + index}.JPG" for index in range(10)]
@@ -78,10 +63,10 @@ def test_llff_with_colmap_pairs_renamed_copies_in_order(tmp_path):
         (root / "images" / name).unlink()
     np.save(root / "poses_bounds.npy", np.zeros((10, 17)))  # COLMAP comes first: it knows the lens
     outputs = parse(root, "test")
-    assert names(outputs) == ["image000", "image001", "image008"]
+    assert names(outputs) == ["image000", "image008"]
     K = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
     x, y, w = K @ (opencv_matrices(10)[8] @ [*POINT, 1.0])[:3]
-    np.testing.assert_allclose(pixel(outputs, 2, moved(outputs, POINT)), [x / w / 2, y / w / 2], atol=1e-3)
+    np.testing.assert_allclose(pixel(outputs, 1, moved(outputs, POINT)), [x / w / 2, y / w / 2], atol=1e-3)
     np.testing.assert_allclose(outputs.metadata["points3D_xyz"][1], moved(outputs, points[1]), atol=1e-5)
 
 
@@ -120,32 +105,14 @@ def test_llff_knows_the_lens_from_the_camera_file(tmp_path):
     assert not parse(tmp_path, images_path=Path("images_4")).cameras.distortion_params.any()
 
 
-NVOS = {
-    "fern": "IMG_4027", "flower": "IMG_2962", "fortress": "IMG_1800", "horns": "DJI_20200223_163024_597",
-    "leaves": "IMG_2997", "orchids": "IMG_4480", "trex": "DJI_20200223_163619_411",
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("scene", NVOS)
-def test_nvos_holds_out_its_view_of_every_llff_scene(tmp_path, scene):
-    """The table of the method, section 9; the view is one that the rule of every 8th would train on."""
-    root = tmp_path / scene
-    stems = [f"AAA_{index}" for index in range(3)] + [NVOS[scene]]  # "AAA" comes first in the order of names
-    for index, stem in enumerate(stems):
-        write_image(root / f"images_4/{stem}.png", noise(index))
-    write_poses_bounds(root, stems, 4)
-    assert title(root) == "LLFF"
-    assert names(parse(root, "test")) == [stems[0], NVOS[scene]] and names(parse(root)) == stems[1:3]
-
-
 def test_fern_points_have_the_colours_of_the_images():
     """Poses, scaled intrinsics, lens and seed points agree: points meet their colours; mirrored they do not."""
     from PIL import Image
 
     root = real("fern")
     outputs, test = parse(root), parse(root, "test")
-    assert title(root) == "LLFF" and len(names(outputs)) == 16
-    assert names(test) == ["image000", "image001", "image008", "image016"]  # IMG_4027 is image001
+    assert title(root) == "LLFF" and len(names(outputs)) == 17
+    assert names(test) == ["image000", "image008", "image016"]
     assert len(outputs.metadata["points3D_xyz"]) == 10091 and not outputs.metadata["points3D_random"]
     assert outputs.cameras.distortion_params[0, 0] == pytest.approx(0.01975, abs=1e-5)
     points = outputs.metadata["points3D_xyz"].double().numpy()

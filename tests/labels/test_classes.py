@@ -12,7 +12,6 @@ from beags_plugin.labels.classes import (
     check_names,
     read_classes,
     read_id_mask,
-    read_mask,
     read_object_mask,
     write_mask,
 )
@@ -67,7 +66,7 @@ GREY = np.array([[0, 100, 128], [255, 1, 127]], dtype=np.uint8)
 )
 def test_binary_masks_of_all_kinds(tmp_path, array, inside):
     Image.fromarray(array).save(tmp_path / "a.png")
-    ones = read_mask(tmp_path / "a.png", "binary")
+    ones = read_object_mask(tmp_path / "a.png")
     ones[ones == IGNORE] = 0  # Masks of 16 bits alone hold it.
     assert ones.dtype == np.uint16 and np.array_equal(ones, np.asarray(inside, int))
 
@@ -94,7 +93,6 @@ def test_grey_beside_black_and_white_alone_cannot_be_told(tmp_path, array, untol
     ids = read_object_mask(tmp_path / "a.png")
     assert ids.dtype == np.uint16 and set(ids.ravel().tolist()) <= {0, 1, IGNORE}
     assert np.array_equal(ids == IGNORE, untold)
-    assert np.array_equal(read_mask(tmp_path / "a.png", "binary"), ids)
 
 
 def test_a_picture_is_no_binary_mask(tmp_path):

@@ -109,7 +109,7 @@ def test_a_view_that_alone_shows_an_object_at_a_place_is_not_to_be_inverted(trai
     coverage = Coverage([0, 1], pixels, np.zeros(12, np.int64), pixels.sum(1), np.ones(12, bool))
     names = [f"v{view:02d}" for view in range(12)]
     masks, used = [Path(f"masks/{name}.png") for name in names], [trained or view not in (3, 5) for view in range(12)]
-    files = MaskFiles(names, [(1, 1)] * 12, masks, Path("masks"), "ids", (), used, None, Path())
+    files = MaskFiles(names, [(1, 1)] * 12, masks, Path("masks"), (), used, None, Path())
     (issue,) = views_against_others(Agreement(labels, 2), files, coverage, {0: "background", 1: "bear"})
     assert issue.kind == "only view" and "invert" not in issue.message
     assert "masks/v03.png, v05.png are the only views that show 1 (bear) there" in issue.message

@@ -124,32 +124,20 @@ mistakes(
 )
 
 
-def scene(
-    photos: str, file: str, content: np.ndarray | dict[str, Any] | bytes, preset: str = "beags-tiny"
-) -> Callable[[Place], Any]:
-    """Return a mistake in the file of cameras of a folder with nine photos."""
+def llff(rows: np.ndarray | bytes) -> Callable[[Place], Any]:
+    """Return a mistake in poses_bounds.npy of a folder with nine photos."""
 
     def make(at: Place):
         folder = at.root / "scene"
         for index in range(9):
-            write_image(folder / photos.format(index), noise(index))
-        if isinstance(content, bytes):
-            (folder / file).write_bytes(content)
-        elif isinstance(content, dict):
-            np.savez(folder / file, **content)
+            write_image(folder / f"images/v{index}.png", noise(index))
+        if isinstance(rows, bytes):
+            (folder / "poses_bounds.npy").write_bytes(rows)
         else:
-            np.save(folder / file, content)
-        return at.train(data=folder, preset=preset)
+            np.save(folder / "poses_bounds.npy", rows)
+        return at.train(data=folder, preset="beags-base")
 
     return make
-
-
-def llff(rows: np.ndarray | bytes) -> Callable[[Place], Any]:
-    return scene("images/v{}.png", "poses_bounds.npy", rows, "beags-base")
-
-
-def dtu(content: dict[str, Any]) -> Callable[[Place], Any]:
-    return scene("image/{:06d}.png", "cameras_sphere.npz", content)
 
 
 def llff_rows() -> np.ndarray:
@@ -164,8 +152,6 @@ def changed(column: int, value: float) -> np.ndarray:
     return rows
 
 
-K = np.array([[17.0, 0, 10, 0], [0, 16, 6, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-DTU = {f"world_mat_{index}": K @ np.linalg.inv(pose @ np.diag([1.0, -1, -1, 1])) for index, pose in enumerate(ring(9))}
 ENDLESS = str({"descr": "<f8", "fortran_order": False, "shape": (10**15, 17)}).ljust(117).encode()
 mistakes(
     "poses",
@@ -176,9 +162,5 @@ mistakes(
         "poses_bounds.npy with a depth of 0": llff(changed(15, 0.0)),
         "poses_bounds.npy is text": llff(b"no array"),
         "poses_bounds.npy promises 10^15 rows": llff(b"\x93NUMPY\x01\x00v\x00" + ENDLESS + b"\n"),
-        "cameras_sphere.npz lacks a key": dtu({**DTU, "world_mat_3": [1.0]}),
-        "cameras_sphere.npz of fewer cameras": dtu({name: DTU[name] for name in DTU if name != "world_mat_8"}),
-        "cameras_sphere.npz singular": dtu({**DTU, "world_mat_3": np.zeros((4, 4))}),
-        "cameras_sphere.npz with words": dtu({**DTU, "world_mat_3": np.array(["a"])}),
     },
 )

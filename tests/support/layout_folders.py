@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from data_folders import CX, CY, FX, FY, HEIGHT, WIDTH, noise, ring, write_colmap, write_image
+from data_folders import HEIGHT, WIDTH, noise, ring, write_colmap, write_image
 
 FOCAL = 32.0  # focal length of the original images of LLFF and DTU
 
@@ -86,37 +86,3 @@ def write_3dovs(root: Path) -> list[str]:
             write_image(root / f"segmentations/{view}/{name}.png", np.roll(255 * ids(), 5 * index, axis=1))
     write_poses_bounds(root, names, 1)
     return [Path(name).stem for name in names]
-
-
-def write_spin_nerf(root: Path, gone: int = 3) -> list[str]:
-    """Write a scene: images/*.jpg, images_4/*.png, images_4/label/*.png (0 and 1) of all but the first, sparse/0."""
-    names = [f"20220819_1055{index:02d}.jpg" for index in range(12)]
-    write_colmap(root, names=names)
-    write_copies(root, [Path(name).with_suffix(".png").name for name in names], 4)
-    for name in names[gone:]:
-        write_image(root / f"images_4/label/{Path(name).stem}.png", ids(1, WIDTH // 4, HEIGHT // 4))
-    return [Path(name).stem for name in names]
-
-
-def write_dtu(root: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Write scan: image/NNNNNN.png, mask/NNN.png (three channels), cameras_sphere.npz; returns what it was made from.
-
-    Those are the projections [V, 3, 4] from the unit sphere's world to pixels whose centres are whole numbers, and
-    ``scale_mat`` [4, 4]. The file's matrices have another scale, half of them a negative one.
-    """
-    scale = np.diag([250.0, 250.0, 250.0, 1.0])
-    scale[:3, 3] = [10.0, -20.0, 600.0]
-    K = np.array([[FX, 0.0, CX], [0.0, FY, CY], [0.0, 0.0, 1.0]])
-    entries, projections = {}, []
-    for index, matrix in enumerate(opencv_matrices(9)):
-        write_image(root / f"image/{index:06d}.png", noise(index))
-        write_image(root / f"mask/{index:03d}.png", np.repeat(255 * ids()[..., None], 3, axis=2))
-        projection = np.eye(4)
-        projection[:3] = K @ matrix[:3]
-        projections.append(projection[:3])
-        world = projection @ np.linalg.inv(scale)
-        entries[f"world_mat_{index}"] = (world * (-2.0 if index % 2 else 3.0)).astype(np.float32)
-        entries[f"scale_mat_{index}"] = scale.astype(np.float32)
-        entries[f"world_mat_inv_{index}"] = np.linalg.inv(world)
-    np.savez(root / "cameras_sphere.npz", **entries)
-    return np.stack(projections), scale

@@ -25,7 +25,7 @@ from beags_plugin.plugin.options.config import config_text
 from beags_plugin.plugin.options.saved_config import load_run_config
 from beags_plugin.runs import run_config
 from beags_plugin.system.errors import UserError
-from beags_plugin.system.reading.arrays import load_array, load_arrays
+from beags_plugin.system.reading.arrays import load_array
 from beags_plugin.system.reading.images import read_image
 from beags_plugin.system.reading.tensors import load_tensors
 from beags_plugin.system.reading.text import load_json
@@ -229,6 +229,16 @@ def test_packed_checkpoints_are_refused(tmp_path):
         load_tensors(packed(tmp_path / "b.pt", members))
 
 
+def test_an_archive_whose_list_is_a_lie_is_refused(tmp_path):
+    """The list says that a stored member has 4 GB, more than the file."""
+    torch.save(torch.zeros(3), tmp_path / "a.pt")
+    content = (tmp_path / "a.pt").read_bytes()
+    at = content.index(b"PK\x01\x02") + 24  # its size in the list
+    (tmp_path / "a.pt").write_bytes(content[:at] + struct.pack("<I", 0xFFFFFFF0) + content[at + 4 :])
+    with pytest.raises(ValueError, match="longer than the file"):
+        load_tensors(tmp_path / "a.pt")
+
+
 def header(shape: tuple[int, ...], dtype: str = "<f8") -> bytes:
     text = str({"descr": dtype, "fortran_order": False, "shape": shape}).ljust(117) + "\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode()
@@ -246,16 +256,6 @@ def test_objects_are_not_unpickled(tmp_path):
     with pytest.raises(ValueError, match="holds objects"):
         load_array(tmp_path / "a.npy")
     assert not (tmp_path / "ran").exists()
-
-
-def test_an_archive_whose_list_is_a_lie_is_refused(tmp_path):
-    """The list says that a stored member has 4 GB, more than the file."""
-    np.savez(tmp_path / "a.npz", a=np.zeros(3))
-    content = (tmp_path / "a.npz").read_bytes()
-    at = content.index(b"PK\x01\x02") + 24  # its size in the list
-    (tmp_path / "a.npz").write_bytes(content[:at] + struct.pack("<I", 0xFFFFFFF0) + content[at + 4 :])
-    with pytest.raises(ValueError, match="longer than the file"):
-        load_arrays(tmp_path / "a.npz")
 
 
 # -- pictures and text ------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from data_folders import noise, write_colmap, write_image, write_transforms
-from layout_folders import write_dtu, write_llff
+from layout_folders import write_llff
 from parsed_views import parse
 
 from beags_plugin.plugin.views.dataparser import BeagsDataParserConfig
@@ -69,11 +69,6 @@ def in_llff(root: Path, content: bytes) -> None:
     (root / "poses_bounds.npy").write_bytes(content)
 
 
-def in_dtu(root: Path, content: bytes) -> None:
-    write_dtu(root)
-    (root / "cameras_sphere.npz").write_bytes(content)
-
-
 def in_class_names(root: Path, content: bytes) -> None:
     write_transforms(root)
     (root / "classes.json").write_bytes(content)
@@ -86,7 +81,6 @@ READERS = {
     "seed points": in_seed_points,
     **{name: in_colmap(name) for name in ("cameras.bin", "images.bin", "points3D.bin", "cameras.txt", "images.txt")},
     "LLFF": in_llff,
-    "DTU": in_dtu,
     "classes.json": in_class_names,
 }
 NO_DATA = {("cameras.txt", "an empty file"), ("images.txt", "an empty file")}  # an empty one holds no camera or image

@@ -13,7 +13,7 @@ class NerfstudioLayout(Layout):
 
     title = "nerfstudio"
     marks = "transforms.json"
-    refines = ("colmap", "dtu", "llff", "mipnerf360")
+    refines = ("colmap", "llff", "mipnerf360")
 
     def missing(self, root: Path) -> str | None:
         return None if root.is_file() or (root / "transforms.json").is_file() else "no transforms.json"

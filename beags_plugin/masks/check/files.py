@@ -12,7 +12,7 @@ import numpy as np
 from beags_plugin.data.files import IMAGE_SUFFIXES, image_size
 from beags_plugin.data.orientation import turned_note, upright_mask_error
 from beags_plugin.labels.class_ids import BACKGROUND, IGNORE, count_ids
-from beags_plugin.labels.classes import palette_of, read_mask
+from beags_plugin.labels.classes import palette_of, read_id_mask
 from beags_plugin.labels.id_checks import check_ids, check_palettes
 from beags_plugin.masks.check.issues import STOPS, Issue, named, percent
 from beags_plugin.system.errors import UserError
@@ -30,7 +30,7 @@ class MaskFiles:
     """The views of a scene and their masks.
 
     stems: names of the V images (``data.files.photo_names``). sizes: (width, height) of their files. masks: file of
-    each view, or None. folder: of the masks. kind, ignore_ids: see ``labels.classes.read_mask``. trained: False for
+    each view, or None. folder: of the masks. ignore_ids: see ``labels.classes.read_id_mask``. trained: False for
     held-out views. names: id to name from the user or the layout, or None. names_file: their file. photos: the files of
     the views.
     """
@@ -39,7 +39,6 @@ class MaskFiles:
     sizes: Sequence[tuple[int, int]]
     masks: Sequence[Path | None]
     folder: Path
-    kind: str
     ignore_ids: Sequence[int]
     trained: Sequence[bool]
     names: Mapping[int, str] | None
@@ -49,7 +48,7 @@ class MaskFiles:
     def read(self, view: int) -> np.ndarray | None:
         """Read the class ids or IGNORE of a view, [H, W] uint16; None without a mask; raise ``UserError``."""
         path = self.masks[view]
-        return None if path is None else read_mask(path, self.kind, self.ignore_ids)
+        return None if path is None else read_id_mask(path, self.ignore_ids)
 
     def paths(self, views: Sequence[int]) -> str:
         """Name the masks of some views: the first by its path, the others by their paths below the folder."""
@@ -88,12 +87,9 @@ def check_files(files: MaskFiles, progress: Callable[[int, int], None] | None = 
             size = image_size(path)  # read from the header, so that a far too large image is not decoded
             if size != tuple(files.sizes[view]):
                 return _wrong_size(files, view, size)
-            labels = files.read(view)
-            if files.kind == "ids" and labels is not None:
-                check_ids(path, labels)
+            check_ids(path, labels := read_id_mask(path, files.ignore_ids))
         except UserError as error:
             return Issue("error", "type", str(error), STOPS, (files.stems[view],))
-        assert labels is not None
         ids, pixels = count_ids(labels)
         if len(ids) > MOST_IDS:
             return Issue(
@@ -128,8 +124,7 @@ def check_files(files: MaskFiles, progress: Callable[[int, int], None] | None = 
 def _palettes(files: MaskFiles, views: Sequence[int], pool: ThreadPoolExecutor) -> list[Issue]:
     masks = [path for view in views if (path := files.masks[view]) is not None]
     try:
-        if files.kind == "ids":
-            check_palettes(masks, list(pool.map(palette_of, masks)))
+        check_palettes(masks, list(pool.map(palette_of, masks)))
     except UserError as error:
         return [Issue("error", "type", str(error), STOPS)]
     return []
@@ -215,7 +210,7 @@ def _strays(files: MaskFiles) -> Iterator[Issue]:
 
 def _names(files: MaskFiles, coverage: Coverage) -> Iterator[Issue]:
     """Find ids without a name, and names without a mask."""
-    if files.names is None or files.kind != "ids":
+    if files.names is None:
         return
     for column, class_id in enumerate(coverage.ids):
         views = np.flatnonzero(coverage.pixels[:, column])

@@ -12,9 +12,6 @@ from beags_benchmarks.experiments.captures.options import CapturesOptions
 from beags_benchmarks.experiments.options import ExperimentOptions
 from beags_benchmarks.experiments.paper.options import PaperOptions
 from beags_benchmarks.samples.command import BenchSample
-from beags_plugin.commands.answers import CONSOLE
-from beags_plugin.commands.starting import starting
-from beags_plugin.system.errors import UserError
 
 
 @dataclass
@@ -64,43 +61,21 @@ class CapturesBench(CapturesOptions):
 
 
 @dataclass
-class TruthBench:
-    """Take downloaded masks of a scene of LLFF as ground truth for beags eval; scribbles become prompts for masks."""
+class Nvos:
+    """Take NVOS's masks of a scene of LLFF as its ground truth; its scribbles become prompts for masks."""
 
     data: Path
-    """Folder of the scene; its name is the scene's, else give --scene."""
-    nvos: Path | None = None
+    """Folder of the scene, named as NVOS names it."""
+    nvos: Path
     """NVOS's folder, of masks, scribbles and reference_image."""
-    spin_nerf: Path | None = None
-    """The folder of SPIn-NeRF's masks, <scene>/<photo>.png."""
-    scene: str | None = None
-    """The scene's name in the download, if it is not the folder's."""
-    object: str | None = None
-    """Name of SPIn-NeRF's object in classes.json; the scene's name if left out."""
     overwrite: bool = False
     """Replace masks and prompts that are there already."""
-    layout: str = "auto"
-    """How the data set lays out its files (docs/data.md); auto recognises it."""
-    images_path: Path | None = None
-    """Folder of the images, if not the layout's own."""
 
     def run(self) -> None:
-        if (self.nvos is None) == (self.spin_nerf is None):
-            raise UserError("give one of --nvos and --spin-nerf the folder of the downloaded masks.")
-        if self.object is not None and self.spin_nerf is None:
-            raise UserError("NVOS names its objects: leave --object out, and call them so in classes.json.")
-        with starting(self):
-            from beags_benchmarks.experiments.paper.downloads import read_nvos, read_spin_nerf
-            from beags_benchmarks.experiments.paper.truth import import_truth
-            from beags_plugin.objects.check_masks import data_options
-        scene = self.scene or self.data.resolve().name.lower()
-        if self.nvos is not None:
-            objects = read_nvos(self.nvos, scene)
-        else:
-            assert self.spin_nerf is not None
-            objects = read_spin_nerf(self.spin_nerf, scene, self.object or scene)
-        for line in import_truth(data_options(self.data, self.layout, self.images_path), objects, self.overwrite):
-            CONSOLE.print(line)
+        from beags_benchmarks.experiments.paper.nvos import import_nvos
+
+        for line in import_nvos(self.data, self.nvos, self.overwrite):
+            print(line)
 
 
 SHIPPED = {
@@ -117,7 +92,7 @@ SHIPPED = {
 """Commands by experiment, with the sentence of their help."""
 
 if TYPE_CHECKING:
-    Measurement = ShippedExperiment | ExperimentFile | PaperBench | CapturesBench | BenchSample | TruthBench
+    Measurement = ShippedExperiment | ExperimentFile | PaperBench | CapturesBench | BenchSample | Nvos
 else:
     Measurement = Union[  # noqa: UP007  (of a tuple)
         tuple(
@@ -132,7 +107,7 @@ else:
             Annotated[PaperBench, tyro.conf.subcommand("paper")],
             Annotated[CapturesBench, tyro.conf.subcommand("captures")],
             Annotated[BenchSample, tyro.conf.subcommand("sample")],
-            Annotated[TruthBench, tyro.conf.subcommand("truth")],
+            Annotated[Nvos, tyro.conf.subcommand("nvos")],
         )
     ]
 

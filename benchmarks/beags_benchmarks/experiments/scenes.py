@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.labels.classes import read_mask, write_mask
+from beags_plugin.labels.classes import read_id_mask, write_mask
 from beags_plugin.system.digests import folder_digest, value_digest
 from beags_plugin.system.errors import UserError, writing
 from beags_plugin.system.progress import progress_bar
@@ -153,10 +153,10 @@ def damaged_masks(scene: TrialScene, degree: float, folder: Path, write: bool = 
     for split, outputs in splits.items():  # the second split, training, overwrites views that are in both
         classes = np.array(sorted(outputs.metadata["classes"]))
         masks = _best_masks(outputs.metadata, split)
-        for image, (mask, kind) in zip(outputs.image_filenames, masks, strict=True):
+        for image, mask in zip(outputs.image_filenames, masks, strict=True):
             if mask is None or (split == "train" and image.stem in dropped):
                 continue
-            labels = read_mask(mask, kind, outputs.metadata["ignore_ids"])
+            labels = read_id_mask(mask, outputs.metadata["ignore_ids"])
             if split == "train":
                 if flawed is not None:
                     depth = load_array(scene.data / f"ground_truth/depth/{image.stem}.npy")
@@ -230,10 +230,9 @@ def _is_whole(target: Path) -> bool:
     return False
 
 
-def _best_masks(metadata: dict[str, Any], split: str) -> list[tuple[Path | None, str]]:
-    """Return each view's mask and its kind: the exact mask of a training view if there is one, else the given mask."""
+def _best_masks(metadata: dict[str, Any], split: str) -> list[Path | None]:
+    """Return each view's mask: the exact mask of a training view if there is one, else the given mask."""
     given: list[Path | None] = metadata["mask_filenames"]
     truth = metadata["ground_truth"]
     exact = truth["masks"] if truth and split == "train" else [None] * len(given)
-    kind: str = metadata["mask_kind"]
-    return [(best, "ids") if best else (mask, kind) for best, mask in zip(exact, given, strict=True)]
+    return [best or mask for best, mask in zip(exact, given, strict=True)]

@@ -9,7 +9,7 @@ pytest.importorskip("nerfstudio")
 from beags_benchmarks.experiments.experiment import load_experiment
 from beags_benchmarks.experiments.paper.data_sets import METHODS, NAMES, paper_folder, read_data_set, read_data_sets
 from beags_plugin.data import LAYOUTS
-from beags_plugin.data.layouts import llff, mipnerf360
+from beags_plugin.data.layouts import mipnerf360
 from beags_plugin.system.errors import UserError
 
 DATA_SETS = {data_set.name: data_set for data_set in read_data_sets()}
@@ -43,7 +43,7 @@ def test_figures_are_those_of_the_ablation():
 
 def test_scenes_agree_with_the_layouts():
     assert tuple(DATA_SETS["mip360"].scenes) == mipnerf360.SCENES
-    assert list(DATA_SETS["llff"].scenes) == list(llff.NVOS_TARGETS)
+    assert list(DATA_SETS["llff"].scenes) == list(DATA_SETS["llff"].held_out)
     assert sum(len(objects) for objects in DATA_SETS["llff"].scenes.values()) == 8
     assert [len(objects) for objects in DATA_SETS["lerf"].scenes.values()] == [7, 6, 10]
 

@@ -96,7 +96,7 @@ NOTED = {  # likewise, of parts that only the figures lack
         "llff",
         "ground_truth/visible",
     ): "visible masks of fern belong in {scene}/ground_truth/visible/<object>/"
-    "<photo>.png: beags bench truth --data {scene} --nvos NVOS",
+    "<photo>.png: beags bench nvos --data {scene} --nvos NVOS",
     ("llff", "ground_truth/silhouettes"): "silhouettes of fern belong in {scene}/ground_truth/silhouettes/<object>/",
     ("lerf", "classes.json"): "no class is called 'green apple', 'green toy chair'",
     ("lerf", "test_mask/*/*"): "visible masks of green apple, old camera belong in {scene}/test_mask/<n>/<object>.png",

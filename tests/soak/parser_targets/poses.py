@@ -1,11 +1,9 @@
-"""Parsers of poses: tables in .npy and .npz, COLMAP's binary files, transforms.json."""
+"""Parsers of poses: tables in .npy, COLMAP's binary files, transforms.json."""
 
 from __future__ import annotations
 
 import io
 import struct
-import zipfile
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +15,6 @@ def _poses_bounds(path: Path) -> None:
     from beags_plugin.data.poses_bounds import read_poses_bounds
 
     read_poses_bounds(path, pictures())
-
-
-def _dtu(path: Path) -> None:
-    from beags_plugin.data.layouts.dtu import read_cameras
-
-    read_cameras(path, sorted(pictures().iterdir()))
 
 
 def _colmap(path: Path) -> object:
@@ -56,32 +48,6 @@ def _bounds_files() -> list[bytes]:
     return [_npy(np.stack([row] * 3)), _npy(np.stack([row] * 3).astype(np.float32))]
 
 
-def _npz(arrays: dict[str, np.ndarray], packed: bool = False) -> bytes:
-    file = io.BytesIO()
-    (np.savez_compressed if packed else np.savez)(file, **arrays)
-    return file.getvalue()
-
-
-def _dtu_files() -> list[bytes]:
-    matrix = np.array([[5.0, 0, 3, 0], [0, 5, 3, 0], [0, 0, 1, 2], [0, 0, 0, 1]])
-    arrays = {f"world_mat_{index}": matrix for index in range(3)}
-    return [_npz(arrays), _npz({**arrays, "scale_mat_0": np.eye(4)}, packed=True)]
-
-
-@lru_cache(None)
-def _good_dtu() -> bytes:
-    return _dtu_files()[0]
-
-
-def _as_member(content: bytes) -> bytes:
-    """Return an archive for DTU, one of whose members is these bytes."""
-    file = io.BytesIO(_good_dtu())
-    file.seek(0, io.SEEK_END)
-    with zipfile.ZipFile(file, "a") as archive:
-        archive.writestr("scale_mat_1.npy", content)
-    return file.getvalue()
-
-
 def _image_files() -> list[bytes]:
     rest = (
         struct.pack("<i7di", 1, 1, 0, 0, 0, 0, 0, 0, 1)
@@ -113,8 +79,6 @@ def _transforms_files() -> list[bytes]:
 
 TARGETS = {
     "npy poses": Target("poses_bounds.npy", _poses_bounds, _bounds_files),
-    "npz cameras": Target("cameras_sphere.npz", _dtu, _dtu_files),
-    "npz member": Target("cameras_sphere.npz", _dtu, lambda: [_npy(np.eye(4))], _as_member),
     "colmap images": Target("images.bin", _colmap, _image_files),
     "colmap cameras": Target("cameras.bin", _colmap, _camera_files),
     "colmap points": Target("points3D.bin", _colmap, _point_files),

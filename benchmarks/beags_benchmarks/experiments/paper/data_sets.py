@@ -16,8 +16,8 @@ NAMES = ("mip360", "llff", "lerf", "3dovs")
 METHODS = "methods"  # name of the experiment of the methods
 METRICS = ("extracted", "rendered", "psnr")
 _ENTRIES = {
-    "title", "folders", "layout", "images", "width", "split", "eval_interval", "metrics", "masks", "truth", "scenes",
-    "open", "paper",
+    "title", "folders", "layout", "images", "width", "split", "eval_interval", "held_out", "metrics", "masks",
+    "truth", "scenes", "open", "paper",
 }  # fmt: skip
 
 
@@ -55,9 +55,10 @@ class PaperDataSet:
 
     folders: names below the data root: our name, then those of downloads. layout, eval_interval: options of
     ``beags-data``. images: folder of the photos. width: pixels to which wider photos are scaled down; None keeps all.
-    split: a description. metrics: those of ``METRICS`` that the paper has. scenes: scene to its objects; empty if the
-    scene's own class names apply. open: choices that the paper does not state, and ours. figures: "extracted" and
-    "rendered" to method to (IoU, BIoU) in percent. psnr: dB before and after refinement, or None.
+    split: a description. held_out: scene to the stem of a photo that is held out besides. metrics: those of ``METRICS``
+    that the paper has. scenes: scene to its objects; empty if the scene's own class names apply. open: choices that the
+    paper does not state, and ours. figures: "extracted" and "rendered" to method to (IoU, BIoU) in percent. psnr: dB
+    before and after refinement, or None.
     """
 
     name: str
@@ -72,6 +73,7 @@ class PaperDataSet:
     scenes: Mapping[str, tuple[str, ...]]
     width: int | None = None
     eval_interval: int | None = None
+    held_out: Mapping[str, str] = field(default_factory=dict)
     open: Mapping[str, str] = field(default_factory=dict)
     figures: Mapping[str, Mapping[str, tuple[float, float]]] = field(default_factory=dict)
     psnr: tuple[float, float] | None = None
@@ -132,6 +134,7 @@ def _data_set(name: str, content: Mapping[str, Any]) -> PaperDataSet:
         scenes={scene: _texts(objects, f"scene {scene}") for scene, objects in content["scenes"].items()},
         width=_whole(content.get("width"), "width"),
         eval_interval=_whole(content.get("eval_interval"), "eval_interval"),
+        held_out={scene: _text(stem, f"held_out.{scene}") for scene, stem in content.get("held_out", {}).items()},
         open={what: _text(choice, f"open.{what}") for what, choice in content.get("open", {}).items()},
         figures={
             metric: {method: _pair(pair, f"paper.{metric}.{method}") for method, pair in rows.items()}

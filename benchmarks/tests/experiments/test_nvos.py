@@ -1,4 +1,4 @@
-"""Masks and scribbles of NVOS, and masks of SPIn-NeRF: their trees, complete and with every part missing once."""
+"""Masks and scribbles of NVOS: their tree, complete and with every part missing once."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from data_folders import HEIGHT, WIDTH, noise, write_image
 from layout_folders import ids, write_llff
 from parsed_views import parse
 
-from beags_benchmarks.experiments.paper.downloads import POINTS, points_of, read_nvos
+from beags_benchmarks.experiments.paper.nvos import POINTS, points_of, read_nvos
 from beags_plugin.commands import cli
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import read_object_mask
@@ -37,15 +37,6 @@ def write_nvos(root: Path) -> Path:
     return root
 
 
-def write_spin_nerf_masks(root: Path) -> Path:
-    """Write masks of fern's first four photos as SPIn-NeRF has them, with pictures beside them."""
-    for index in range(4026, 4030):
-        write_image(root / f"fern/IMG_{index}.png", ids(1, 2 * WIDTH, 2 * HEIGHT))
-        write_image(root / f"fern/IMG_{index}_pseudo.png", noise(index))
-        write_image(root / f"fern/IMG_{index}_cutout.png", noise(index))
-    return root
-
-
 @pytest.fixture
 def fern(tmp_path):
     write_llff(tmp_path / "fern")
@@ -58,7 +49,7 @@ def nvos(tmp_path):
 
 
 def truth(*words: object) -> None:
-    cli.main(["bench", "truth", *map(str, words)])
+    cli.main(["bench", "nvos", *map(str, words)])
 
 
 def refused(capsys, *words: object) -> str:
@@ -74,12 +65,12 @@ def test_nvos_is_scored_in_its_view_and_prompts_in_its_reference(fern, nvos, cap
     text = " ".join(capsys.readouterr().out.split())
     assert f"fern: 1 visible mask in {fern}/ground_truth/visible/fern" in text
     assert f"beags masks make --data {fern} --source sam2 --options prompts={fern}/prompts.json" in text
-    test = parse(fern, "test")
+    test = parse(fern, "test", images_path=Path("images"), held_out=(TARGET,))
     masks = dict(
         zip([p.stem for p in test.image_filenames], test.metadata["ground_truth"]["visible"]["fern"], strict=True)
     )
     assert [stem for stem, mask in masks.items() if mask is not None] == [TARGET]
-    assert ((read_object_mask(masks[TARGET]) == 1) == (ids(1, 4 * WIDTH, 4 * HEIGHT) > 0)).all()
+    assert (read_object_mask(masks[TARGET]) == (ids(1, 4 * WIDTH, 4 * HEIGHT) > 0)).all()
     (prompted,) = read_prompts(fern / "prompts.json")
     prompt = prompted.prompts[REFERENCE]
     assert prompted.name == "fern" and 0 < len(prompt.points) <= 2 * POINTS
@@ -96,36 +87,15 @@ def test_what_cannot_be_told_is_kept(fern, nvos):
     assert ((kept == IGNORE) == (mask == 128)).all() and ((kept == 1) == (mask == 255)).all() and (mask == 255).any()
 
 
-def test_smaller_copies_are_found_by_the_order_of_the_cameras_names(fern, nvos):
-    truth("--data", fern, "--nvos", nvos, "--images-path", "images_4")
-    test = parse(fern, "test", images_path=Path("images_4"))
-    found = test.metadata["ground_truth"]["visible"]["fern"]
-    assert [p.stem for p, mask in zip(test.image_filenames, found, strict=True) if mask is not None] == ["image001"]
-    assert list(read_prompts(fern / "prompts.json")[0].prompts) == ["image007"]
-
-
 def test_a_scene_may_have_two_objects_and_another_name(nvos):
     assert [each.name for each in read_nvos(nvos, "horns")] == ["horns_center", "horns_left"]
-    with pytest.raises(UserError, match="has no object of a scene 'room': name one of fern, horns_center, horns_left"):
+    with pytest.raises(UserError, match="has no object of a scene 'room': name the scene's folder as one of"):
         read_nvos(nvos, "room")
-
-
-def test_spin_nerf_masks_every_photo_that_has_one(fern, tmp_path, capsys):
-    masks = write_spin_nerf_masks(tmp_path / "SPIn-NeRF_masks")
-    truth("--data", fern, "--spin-nerf", masks, "--object", "plant")
-    assert f"plant: 4 visible masks in {fern}/ground_truth/visible/plant" in " ".join(capsys.readouterr().out.split())
-    written = sorted(path.name for path in (fern / "ground_truth/visible/plant").iterdir())
-    assert written == [f"IMG_{index}.png" for index in range(4026, 4030)]
-    found = parse(fern, "test").metadata["ground_truth"]["visible"]["plant"]
-    assert [mask is not None for mask in found] == [True, True, False]  # 4026 and 4027; 4034 has none
-    (masks / "fern/IMG_9999.png").write_bytes((masks / "fern/IMG_4026.png").read_bytes())
-    truth("--data", fern, "--spin-nerf", masks / "fern", "--object", "plant", "--overwrite")
-    assert "1 mask of other photos is left out (IMG_9999)." in " ".join(capsys.readouterr().out.split())
 
 
 MISSING = {  # paths to remove from NVOS's folder, and the sentence about each
     "masks": "has no folder masks: give --nvos the folder that holds masks and scribbles.",
-    "masks/fern": "has no object of a scene 'fern': name one of horns_center, horns_left with --scene.",
+    "masks/fern": "has no object of a scene 'fern': name the scene's folder as one of ['horns_center', 'horns_left'].",
     f"masks/fern/{TARGET}_mask.png": "masks/fern holds no mask <photo>_mask.png: restore the download.",
 }
 
@@ -143,7 +113,7 @@ def test_without_scribbles_masks_alone_are_taken(fern, nvos, part, capsys):
     path = nvos / part
     shutil.rmtree(path) if path.is_dir() else path.unlink()
     truth("--data", fern, "--nvos", nvos)
-    assert "There are no scribbles, so no prompts are written." in capsys.readouterr().out
+    assert "No photo of the scene has scribbles, so no prompts are written." in capsys.readouterr().out
     assert (fern / f"ground_truth/visible/fern/{TARGET}.png").exists() and not (fern / "prompts.json").exists()
 
 
@@ -153,21 +123,7 @@ def test_scribbles_on_an_absent_photo_are_left_out(fern, nvos, capsys):
     assert "No photo of the scene has scribbles, so no prompts are written." in capsys.readouterr().out
 
 
-def test_scribbles_on_a_held_out_photo_are_told(fern, nvos, capsys):
-    truth("--data", fern, "--nvos", nvos)
-    assert "held out" not in capsys.readouterr().out
-    (nvos / f"reference_image/fern/{REFERENCE}.JPG").rename(nvos / "reference_image/fern/IMG_4034.JPG")
-    truth("--data", fern, "--nvos", nvos, "--overwrite")
-    text = " ".join(capsys.readouterr().out.split())
-    assert "fern: its scribbles are on IMG_4034, which is held out, so no mask may be made from it" in text
-
-
 def test_mistakes_are_refused_before_anything_is_written(fern, nvos, tmp_path, capsys):
-    both = refused(capsys, "--data", fern, "--nvos", nvos, "--spin-nerf", nvos)
-    assert both == refused(capsys, "--data", fern)
-    assert "give one of --nvos and --spin-nerf the folder of the downloaded masks." in both
-    assert "NVOS names its objects" in refused(capsys, "--data", fern, "--nvos", nvos, "--object", "plant")
-    assert "holds no mask <photo>.png" in refused(capsys, "--data", fern, "--spin-nerf", nvos)
     other = write_nvos(tmp_path / "other")
     (other / f"masks/fern/{TARGET}_mask.png").rename(other / "masks/fern/IMG_1_mask.png")
     assert "no photo of" in (text := refused(capsys, "--data", fern, "--nvos", other)) and "is called IMG_1" in text
@@ -175,7 +131,7 @@ def test_mistakes_are_refused_before_anything_is_written(fern, nvos, tmp_path, c
     (other / "masks/fern/IMG_1_mask.png").unlink()
     assert "is 30x30 pixels but the photo" in refused(capsys, "--data", fern, "--nvos", other)
     write_image(nvos / "scribbles/fern/neg_1.png", ids(1, 30, 30))
-    assert "differ in size: restore the download" in refused(capsys, "--data", fern, "--nvos", nvos)
+    assert "differ in size, or are on several photos" in refused(capsys, "--data", fern, "--nvos", nvos)
     assert not (fern / "ground_truth").exists() and not (fern / "prompts.json").exists()
 
 
