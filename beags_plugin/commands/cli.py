@@ -76,7 +76,7 @@ class Demo:
 
 @dataclass
 class Sample:
-    """Generate a scene with exact ground truth: photos, damaged masks, silhouettes, depth, objects removed."""
+    """Generate a scene with exact ground truth: photos, damaged masks, silhouettes, depth."""
 
     output: Annotated[Path, OUTPUT] = Path("outputs/sample")
     """Folder to write."""

@@ -11,7 +11,7 @@ from beags_plugin.data.files import files_of_views
 from beags_plugin.system.wording import verb
 
 FilesPerView = list[Path | None]
-OF_OBJECTS = ("visible", "silhouettes", "seen")
+OF_OBJECTS = ("visible", "silhouettes")
 """Kinds of ground truth with a folder of files for each object."""
 
 
@@ -19,13 +19,12 @@ class GroundTruth(TypedDict):
     """Files of exact masks, one or None per view.
 
     masks: id images. The others map an object's name to its files. visible: binary masks of its visible part.
-    silhouettes: of the whole object, without occlusion. seen: of the part of the silhouette that training photos show.
+    silhouettes: of the whole object, without occlusion.
     """
 
     masks: FilesPerView
     visible: dict[str, FilesPerView]
     silhouettes: dict[str, FilesPerView]
-    seen: dict[str, FilesPerView]
 
 
 def of_views(truth: GroundTruth, chosen: Sequence[int]) -> GroundTruth:

@@ -11,14 +11,12 @@ from torch import Tensor
 from beags_plugin.core.cameras import Camera
 from beags_plugin.evaluation.metrics import AGREEMENT, METRICS, CloseUpMetrics, MaskMetrics
 
-MaskKind = Literal["extracted", "seen", "rendered"]
-MASK_KINDS: tuple[MaskKind, ...] = ("extracted", "seen", "rendered")
-"""extracted: the object rendered alone. seen: the same over the parts that training photos show, if the data has a map
-of them. rendered: the object's share of the whole scene."""
+MaskKind = Literal["extracted", "rendered"]
+MASK_KINDS: tuple[MaskKind, ...] = ("extracted", "rendered")
+"""extracted: the object rendered alone. rendered: the object's share of the whole scene."""
 Kind = MaskKind | Literal["close_up"]
 FIGURES: dict[Kind, tuple[str, ...]] = {
     "extracted": METRICS,
-    "seen": METRICS,
     "rendered": (*AGREEMENT, "covered"),
     "close_up": tuple(field.name for field in fields(CloseUpMetrics)),
 }
@@ -49,12 +47,10 @@ class EvalView:
 
     image: [H, W, 3] float in 0..1, the photograph, or None. visible: [h, w] integer class ids or IGNORE, or None
     without masks; predictions are resized to it. silhouettes: object id to [h, w] bool, pixels that the object covers
-    when nothing stands before it. seen: object id to [h, w] bool, the part of the silhouette whose surface some
-    training photo shows; metrics of the kind "seen" leave out the rest. visible_objects: object id to [h, w] bool, the
-    visible part if only some objects were labelled; scored instead of ``visible``. unknown_silhouettes,
-    unknown_visible: object id to [h, w] bool, pixels that may or may not belong to its silhouette or to its mask in
-    ``visible_objects``; they are in neither and do not count. full: the photograph at the resolution of its file, if
-    that is larger.
+    when nothing stands before it. visible_objects: object id to [h, w] bool, the visible part if only some objects were
+    labelled; scored instead of ``visible``. unknown_silhouettes, unknown_visible: object id to [h, w] bool, pixels that
+    may or may not belong to its silhouette or to its mask in ``visible_objects``; they are in neither and do not count.
+    full: the photograph at the resolution of its file, if that is larger.
     """
 
     camera: Camera
@@ -62,7 +58,6 @@ class EvalView:
     visible: Tensor | None = None
     silhouettes: Mapping[int, Tensor] | None = None
     name: str = ""
-    seen: Mapping[int, Tensor] | None = None
     visible_objects: Mapping[int, Tensor] | None = None
     unknown_silhouettes: Mapping[int, Tensor] | None = None
     unknown_visible: Mapping[int, Tensor] | None = None
@@ -75,7 +70,6 @@ class ObjectMetrics:
 
     extracted: MaskMetrics | None
     rendered: MaskMetrics | None
-    seen: MaskMetrics | None = None
     close_up: CloseUpMetrics | None = None
 
 

@@ -52,7 +52,7 @@ class RunMetrics:
         """Return the run as plain values for ``json.dump``; a missing or infinite metric is None.
 
         {"scene", "config", "protocol": {choice: value}, "extracted_truth", "colors_fitted", "notes": [sentence],
-        "mean": {"extracted": {"before": {``FIGURES``}, "after": {...}}, "seen": {...}, "rendered": {...},
+        "mean": {"extracted": {"before": {``FIGURES``}, "after": {...}}, "rendered": {...},
         "close_up": {...}}, "objects": {name: as mean}, "worst": name, "masks": [{"kind", "object", "view", "truth",
         "before": as in mean, "after": {...}}], "views": [{"view"}]}, and {"before", "after"} of every one of
         ``IMAGE_FIGURES`` in itself and in each view.

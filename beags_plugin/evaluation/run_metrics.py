@@ -35,7 +35,6 @@ from beags_plugin.evaluation.truths import (
     object_pixels,
     rendered_truth,
     resized,
-    seen_truth,
 )
 from beags_plugin.losses.photometric import ssim
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings
@@ -78,7 +77,7 @@ def evaluate_scene(
     with torch.no_grad():
         for index, view in enumerate(views):
             renderer = MaskRenderer(surfels, members, view, rasterizer, settings, protocol)
-            for kind in MASK_KINDS if complete else ("extracted", "seen"):
+            for kind in MASK_KINDS if complete else MASK_KINDS[:1]:
                 for class_id, mask in renderer.masks(kind, objects).items():
                     metrics = mask_metrics(mask.prediction, mask.truth, mask.ignore, protocol)
                     if kind == "rendered":
@@ -188,8 +187,7 @@ class MaskRenderer:
             }
         masks = {}
         for class_id in objects:
-            truth = extracted_truth(self.view, class_id) if kind == "extracted" else seen_truth(self.view, class_id)
-            if truth is not None:
+            if (truth := extracted_truth(self.view, class_id)) is not None:
                 mask, hidden = self._extracted(self.members, class_id, truth.others)
                 left_out = [pixels for pixels in (truth.unknown, hidden) if pixels is not None]
                 ignore = torch.stack(left_out).any(dim=0) if left_out else None

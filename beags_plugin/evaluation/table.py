@@ -122,7 +122,6 @@ def _mask_table(caption: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> 
     """Return a table of all kinds of mask metrics per stage."""
     # The metric covered is in files only: one more column is too many for a terminal.
     columns = [(kind, metric) for kind in MASK_KINDS for metric in FIGURES[kind] if metric != "covered"]
-    columns = [c for c in columns if c[0] != "seen" or (c[1] in ("iou", "biou") and _known(rows, stages, *c))]
     meaning = " (before: assignment alone; after: after refinement)" if len(stages) == 2 else ""
     return _table(f"{caption}: masks, %{meaning}", rows, stages, columns)
 
@@ -130,12 +129,8 @@ def _mask_table(caption: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> 
 def _close_up_table(caption: str, rows: Sequence[_Row], stages: Sequence[Stage]) -> Iterator[RenderableType]:
     """Yield a table of close-ups if any row has such metrics."""
     columns = [("close_up", metric) for metric in FIGURES["close_up"]]
-    if any(_known(rows, stages, *column) for column in columns):
+    if any(row[kind][stage][metric] is not None for _, row in rows for stage in stages for kind, metric in columns):
         yield _table(f"{caption}: objects at the photos' own size, PSNR in dB, masks in %", rows, stages, columns)
-
-
-def _known(rows: Sequence[_Row], stages: Sequence[Stage], kind: str, metric: str) -> bool:
-    return any(row[kind][stage][metric] is not None for _, row in rows for stage in stages)
 
 
 def _table(

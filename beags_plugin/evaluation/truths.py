@@ -52,15 +52,6 @@ def extracted_truth(view: EvalView, class_id: int) -> Truth | None:
     return replace(visible, others=(view.visible != class_id) & (view.visible != 0) & (view.visible != IGNORE))
 
 
-def seen_truth(view: EvalView, class_id: int) -> Truth | None:
-    """Return the parts of an object's silhouette that training photos show; None if the data has no map of them."""
-    known = _of(view.seen, class_id)
-    if known is None or view.silhouettes is None or class_id not in view.silhouettes:
-        return None
-    unseen, unknown = view.silhouettes[class_id] & ~known, _of(view.unknown_silhouettes, class_id)
-    return Truth("silhouette", view.silhouettes[class_id], unseen if unknown is None else unseen | unknown)
-
-
 def resized(mask: Tensor, height: int, width: int) -> Tensor:
     """Return a mask [H, W] at another size by nearest pixel, on the CPU; the mask itself if it has that size."""
     if mask.shape == (height, width):

@@ -7,8 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beags_plugin.sample.seen import Photo, shown_in
+from beags_plugin.sample.scene import Scene
+from beags_plugin.sample.tracing import first_hits
 from beags_plugin.sample.views import Picture, View
+
+SAME = 1e-6  # relative rounding error of the distance at which a ray ends
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A training photo: its camera and its scene."""
+
+    view: View
+    scene: Scene
 
 
 @dataclass(frozen=True)
@@ -53,6 +64,21 @@ def seed_points(
     points = SeedPoints(records, places, pixels, labels[pixels] > 0)
     points.paint(picture.image.reshape(-1, 3)[pixels])
     return points
+
+
+def shown_in(photo: Photo, points: np.ndarray) -> np.ndarray:
+    """Return [P] bool: which world points [P, 3] of the scene's surfaces a photo shows."""
+    view = photo.view
+    local = (points - view.center) @ view.camera_to_world[:3, :3]
+    front = np.flatnonzero(local[:, 2] < 0)
+    depth = -local[front, 2]
+    columns = np.floor(view.cx + view.focal * local[front, 0] / depth)
+    rows = np.floor(view.cy - view.focal * local[front, 1] / depth)
+    inside = front[(columns >= 0) & (columns < view.width) & (rows >= 0) & (rows < view.height)]
+    hits, _ = first_hits(photo.scene, view.center, points[inside] - view.center)
+    visible = np.zeros(len(points), dtype=bool)
+    visible[inside] = hits.t > 1.0 - SAME
+    return visible
 
 
 def find_tracks(seeds: Sequence[SeedPoints], photos: Sequence[Photo], turns: bool) -> list[list[int]]:

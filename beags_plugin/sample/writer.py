@@ -16,9 +16,8 @@ import numpy as np
 from beags_plugin.sample import FAMILIES
 from beags_plugin.sample.degrade import Degradation, degrade_mask, dropped_views, resolve_degradation
 from beags_plugin.sample.family import Family
-from beags_plugin.sample.points import SeedPoints, find_tracks, seed_points
+from beags_plugin.sample.points import Photo, SeedPoints, find_tracks, seed_points
 from beags_plugin.sample.scene import Scene
-from beags_plugin.sample.seen import Photo, seen_part, visible_surface, well_seen
 from beags_plugin.sample.shots import Shot, taken
 from beags_plugin.sample.views import Picture, View, render_pixels
 from beags_plugin.system.errors import UserError, unwritable, writing
@@ -111,9 +110,8 @@ def write_sample(
 
     Layout: transforms.json (OpenGL camera-to-world, world z up), images/<stem>.png, masks/<stem>.png (ids; degraded
     for train views, none for dropped ones, exact for test views), classes.json, seed_points.ply, and under
-    ground_truth/ the exact masks/<stem>.png, silhouettes/<object>/<stem>.png (0 or 255), for test views
-    seen/<object>/<stem>.png (the part of the silhouette whose surface training photos show), and depth/<stem>.npy
-    (float32, z along the optical axis); masks and depth are those of the pixel centres. sample.json is the config.
+    ground_truth/ the exact masks/<stem>.png, silhouettes/<object>/<stem>.png (0 or 255), and depth/<stem>.npy (float32,
+    z along the optical axis); masks and depth are those of the pixel centres. sample.json is the config.
     seed_tracks.json lists the training photos that show each seed point: ``photos``, their stems, and ``points``,
     indices of photos for each point of seed_points.ply. Seed points have the colours of the mean exposure.
 
@@ -163,24 +161,18 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
     ends = [config.num_points * i // len(train) for i in range(len(train) + 1)]
     shares = {name: end - first for name, first, end in zip(train, ends[:-1], ends[1:], strict=True)}
     names = shots[0].still.class_names
-    objects = [f"ground_truth/{kind}/{names[c]}" for kind in ("silhouettes", "seen") for c in range(1, len(names))]
+    objects = [f"ground_truth/silhouettes/{name}" for class_id, name in names.items() if class_id]
     for sub in ("images", "masks", "ground_truth/masks", "ground_truth/depth", *objects):
         (folder / sub).mkdir(parents=True)
     seeds: list[SeedPoints] = []
-    surfaces: list[list[np.ndarray]] = [[] for _ in shots[0].still.things]
     photos: list[Photo] = []  # the training photos
-    silhouettes: dict[str, np.ndarray] = {}
     for done, (shot, picture) in enumerate(taken(shots, config.antialias), start=1):
         view, scene = shot.view, shot.scene
         _write_truth(folder, view, picture, names)
         _write_png(folder / "images" / f"{view.name}.png", picture.image)
         mask = picture.labels
-        if view.split == "test":
-            silhouettes[view.name] = picture.silhouettes
-        else:
-            photos.append(Photo(view, scene, picture.depth))
-            for surface, part in zip(surfaces, visible_surface(view, picture), strict=True):
-                surface.append(part)
+        if view.split == "train":
+            photos.append(Photo(view, scene))
             mask = flawed(mask, picture.depth, view)
             mask = degrade_mask(mask, len(names), degradation, config.seed, view.name)
             # Each view has a generator, so that its points do not depend on other pictures.
@@ -193,11 +185,6 @@ def _build(folder: Path, config: SampleConfig, progress: Callable[[int, int], No
             _write_png(folder / "masks" / f"{view.name}.png", mask)
         if progress is not None:
             progress(done, len(views))
-    whole = [well_seen(surface) for surface in surfaces]
-    for view in (view for view in views if view.name in silhouettes):
-        for class_id, (surface, silhouette) in enumerate(zip(whole, silhouettes[view.name], strict=True), start=1):
-            part = np.uint8(255) * seen_part(view, surface, silhouette)
-            _write_png(folder / "ground_truth" / "seen" / names[class_id] / f"{view.name}.png", part)
     with open(folder / "seed_points.ply", "wb") as file:
         write_vertices(file, np.concatenate([points.records for points in seeds]))
     tracks = {"photos": train, "points": find_tracks(seeds, photos, family.turns)}

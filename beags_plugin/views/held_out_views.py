@@ -14,14 +14,14 @@ from beags_plugin.core.cameras import Camera, cropped
 from beags_plugin.data.files import image_size, same_proportions
 from beags_plugin.data.ground_truth import GroundTruth
 from beags_plugin.evaluation.records import EvalView, FullPhoto
-from beags_plugin.labels.class_ids import IGNORE, resize_nearest
+from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.classes import read_id_mask, read_object_mask
 from beags_plugin.system.errors import UserError
 from beags_plugin.views.cameras import camera_from_nerfstudio
 from beags_plugin.views.photo_files import Box
 from beags_plugin.views.run_data import BothSplits
 
-_NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={}, seen={})
+_NO_TRUTH = GroundTruth(masks=[], visible={}, silhouettes={})
 
 
 class HeldOutViews(Sequence[EvalView]):
@@ -90,15 +90,12 @@ class HeldOutViews(Sequence[EvalView]):
             visible = torch.from_numpy(self._straight(file, ids, index).astype(np.int32))
         silhouettes, unknown_silhouettes = self._per_object(truth["silhouettes"], index)
         visible_objects, unknown_visible = self._per_object(truth["visible"], index)
-        seen, _ = self._per_object(truth["seen"], index)
-        seen = {c: _of_size(mask, silhouettes[c]) for c, mask in seen.items() if c in silhouettes}
         return EvalView(
             view.camera,
             view.image_on(self.background),
             visible,
             silhouettes or None,
             view.name,
-            seen or None,
             visible_objects or None,
             unknown_silhouettes or None,
             unknown_visible or None,
@@ -145,7 +142,3 @@ class HeldOutViews(Sequence[EvalView]):
                 "the proportions of the image."
             )
         return self.manager.files["eval"].undistorted(ids, view)
-
-
-def _of_size(mask: Tensor, other: Tensor) -> Tensor:
-    return mask if mask.shape == other.shape else torch.from_numpy(resize_nearest(mask.numpy(), *other.shape))

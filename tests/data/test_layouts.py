@@ -201,7 +201,7 @@ def test_ground_truth_has_a_folder_for_what_is_seen_and_one_for_what_is_hidden(t
     write(tmp_path)
     stem = names(parse(tmp_path, "test", layout=layout, **options))[0]
     folder = tmp_path / "ground_truth"
-    files = {kind: folder / kind / f"thing/{stem}.png" for kind in ("visible", "silhouettes", "seen")}
+    files = {kind: folder / kind / f"thing/{stem}.png" for kind in ("visible", "silhouettes")}
     for path in (*files.values(), folder / f"masks/{stem}.png"):
         write_image(path, ids(1))
     truth = parse(tmp_path, "test", layout=layout, **options).metadata["ground_truth"]

@@ -159,7 +159,7 @@ def test_the_summary_has_the_documented_keys():
     assert set(summary) == {"mean", "objects", "psnr", "seconds", "peak_memory_mb"}
     assert set(summary["objects"]) == {"cup", "box"}
     for row in (summary["mean"], summary["objects"]["cup"]):
-        assert set(row) == {"extracted", "seen", "rendered", "close_up"}
+        assert set(row) == {"extracted", "rendered", "close_up"}
         assert row["extracted"]["assigned"] == pytest.approx({"acc": 0.8, "iou": 0.7, "biou": 0.6, "spill": 0.2})
         assert row["rendered"]["refined"] == pytest.approx({"acc": 0.9, "iou": 0.9, "biou": 0.9, "covered": 0.1})
     assert summary["objects"]["box"]["extracted"]["refined"] == dict.fromkeys(METRICS)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from known_masks import BOX, CLASSES, CUP, FLOOR, SETTINGS, SIZE, Squares, camera, scene, square_mask, truth
+from known_masks import CLASSES, CUP, FLOOR, SETTINGS, SIZE, Squares, camera, scene, square_mask, truth
 from scipy.ndimage import binary_erosion
 
 from beags_plugin.core.membership import Membership
@@ -99,18 +99,6 @@ def test_the_threshold_cuts_both_kinds(threshold):
     assert cup.extracted is not None and cup.rendered is not None
     assert cup.extracted.iou == ratio(predicted, square_mask(*CUP).numpy())
     assert cup.rendered.iou == ratio(predicted, (truth() == 1).numpy())
-
-
-def test_what_no_photo_shows_is_scored_and_the_rest_stands_beside_it():
-    known = square_mask(*CUP)
-    known[:, : int(CUP[0])] = False  # the left half is neither known nor drawn
-    view = EvalView(camera(), None, None, {1: square_mask(*CUP)}, seen={1: known})
-    x, y, half = CUP
-    surfels, ids = scene([(x + half / 2, y, half / 2), BOX]), torch.tensor([1, 2], dtype=torch.int32)
-    cup = evaluate_scene(surfels, Membership(ids), Squares(), SETTINGS, [view], CLASSES).objects[1]
-    predicted = square_mask(x + half / 2, y, half / 2).sum().item()
-    assert cup.extracted is not None and cup.extracted.iou == predicted / square_mask(*CUP).sum().item()
-    assert cup.seen is not None and cup.seen.iou == predicted / known.sum().item()
 
 
 @pytest.mark.parametrize(

@@ -35,12 +35,11 @@ def views() -> dict[str, EvalView]:
     cup, unknown = {1: TOLD}, {1: UNTOLD}
     return {
         "extracted": EvalView(camera(), None, silhouettes=cup, unknown_silhouettes=unknown),
-        "seen": EvalView(camera(), None, silhouettes=cup, seen={1: TOLD | UNTOLD}, unknown_silhouettes=unknown),
         "rendered": EvalView(camera(), None, visible_objects=cup, unknown_visible=unknown),
     }
 
 
-@pytest.mark.parametrize("kind", ["extracted", "seen", "rendered"])
+@pytest.mark.parametrize("kind", ["extracted", "rendered"])
 def test_what_is_drawn_there_changes_no_figure(kind):
     """A cup is right without its untold half, with a quarter of it and with all of it."""
     untold = [(x - HALF, y, half) for x, y, half in QUARTERS]
@@ -48,8 +47,7 @@ def test_what_is_drawn_there_changes_no_figure(kind):
         cup = getattr(evaluated(views()[kind], squares, [1] * len(squares)).objects[1], kind)
         assert cup == MaskMetrics(1.0, 1.0, 1.0, *((None, 0.0) if kind == "rendered" else (0.0, None)))
     told = replace(views()[kind], unknown_silhouettes=None, unknown_visible=None)
-    if kind != "seen":
-        assert getattr(evaluated(told, [CUP], [1]).objects[1], kind).iou == pytest.approx(0.5)
+    assert getattr(evaluated(told, [CUP], [1]).objects[1], kind).iou == pytest.approx(0.5)
 
 
 def test_a_region_that_cannot_be_told_makes_no_boundary():

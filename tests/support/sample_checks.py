@@ -8,8 +8,7 @@ import numpy as np
 from PIL import Image
 
 from beags_plugin.sample import FAMILIES
-from beags_plugin.sample.points import find_tracks, seed_points
-from beags_plugin.sample.seen import Photo
+from beags_plugin.sample.points import Photo, find_tracks, seed_points
 from beags_plugin.sample.tracing import first_hits
 from beags_plugin.sample.views import render_view
 from beags_plugin.sample.writer import SampleConfig
@@ -43,7 +42,7 @@ def assert_tracks_agree(config: SampleConfig) -> None:
     views = [view for view in made.views(config.seed, 64, 48, 8, 1) if view.split == "train"]
     shots = config.shots(made, views)
     pictures = [render_view(shot.scene, shot.light, shot.view, 1) for shot in shots]
-    photos = [Photo(shot.view, shot.scene, picture.depth) for shot, picture in zip(shots, pictures, strict=True)]
+    photos = [Photo(shot.view, shot.scene) for shot in shots]
     generator = np.random.default_rng(0)
     seeds = [
         seed_points(shot.view, picture, shot.lasting(picture), 60, 0.03, generator)

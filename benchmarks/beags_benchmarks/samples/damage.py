@@ -15,9 +15,8 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from beags_plugin.sample.degrade import PRESETS, Degradation, lowest_lots, resolve_degradation
 from beags_plugin.sample.scene import Scene, Thing
-from beags_plugin.sample.seen import surface_points
 from beags_plugin.sample.solids import dot, turned
-from beags_plugin.sample.views import View
+from beags_plugin.sample.views import View, pixel_directions
 from beags_plugin.system.errors import UserError
 
 CHORDS = 4096  # rays that sample the surface of an object
@@ -113,7 +112,8 @@ def flawed_mask(labels: np.ndarray, depth: np.ndarray, view: View, flaws: Sequen
     for flaw in flaws:
         if view.name in flaw.views:
             pixels = np.flatnonzero(np.isin(labels, list(flaw.wrong)))
-            out.ravel()[pixels[flaw.region.holds(surface_points(view, depth)[pixels])]] = flaw.instead
+            places = view.center + depth.reshape(-1, 1)[pixels] * pixel_directions(view)[pixels]
+            out.ravel()[pixels[flaw.region.holds(places)]] = flaw.instead
     return out
 
 

@@ -15,7 +15,7 @@ from beags_benchmarks.samples.config import VariedSample
 from beags_benchmarks.samples.damage import Beyond, Near, flawed_mask, plan_flaws
 from beags_plugin.sample import FAMILIES
 from beags_plugin.sample.degrade import PRESETS, degrade_mask
-from beags_plugin.sample.seen import Photo, shown_in
+from beags_plugin.sample.points import Photo, shown_in
 from beags_plugin.sample.tracing import first_hits
 from beags_plugin.sample.views import pixel_directions
 from beags_plugin.sample.writer import write_sample
@@ -36,19 +36,19 @@ def shown(family):
     scene = made.scene(SEED)
     views = [view for view in made.views(SEED, 96, 72, 12, 1) if view.split == "train"]
     flaws = plan_flaws(scene, [view.name for view in views], SEED, SHARE)
-    photos, labels, points = zip(*(traced(scene, view) for view in views), strict=True)
-    masks = [flawed_mask(exact, photo.depth, photo.view, flaws) for exact, photo in zip(labels, photos, strict=True)]
+    depths, labels, points = zip(*(traced(scene, view) for view in views), strict=True)
+    photos = [Photo(view, scene) for view in views]
+    masks = [flawed_mask(exact, depth, view, flaws) for exact, depth, view in zip(labels, depths, views, strict=True)]
     return scene, flaws, photos, labels, masks, points
 
 
 def traced(scene, view):
-    """The photo, its labels, and [H W, 3] float64 world points that the pixel centres show."""
+    """The depth and the labels of a photo, and [H W, 3] float64 world points that the pixel centres show."""
     rays = pixel_directions(view)
     hits, _ = first_hits(scene, view.center, rays)
     shape = (view.height, view.width)
     labels = np.maximum(hits.surface, 0).astype(np.uint8).reshape(shape)
-    photo = Photo(view, scene, hits.t.astype(np.float32).reshape(shape))
-    return photo, labels, view.center + hits.t[:, None] * rays
+    return hits.t.astype(np.float32).reshape(shape), labels, view.center + hits.t[:, None] * rays
 
 
 def depth_in(region, points):
@@ -117,11 +117,11 @@ def test_what_is_wrong_is_at_the_foot_and_can_be_seen(family, seed):
     made = FAMILIES.get(family)
     scene = made.scene(seed)
     view = made.views(seed, 160, 120, 12, 1)[6]
-    photo, labels, points = traced(scene, view)
+    depth, labels, points = traced(scene, view)
     changed = []
     for flaw in plan_flaws(scene, [view.name], seed, 1.0):
         class_id = flaw.instead or next(iter(flaw.wrong))
-        wrong = (flawed_mask(labels, photo.depth, view, [flaw]) != labels).ravel()
+        wrong = (flawed_mask(labels, depth, view, [flaw]) != labels).ravel()
         own = points[labels.ravel() == class_id]
         size = 2.0 * scene.things[class_id - 1].solid.bound
         if isinstance(flaw.region, Near):

@@ -97,9 +97,7 @@ def test_ground_truth_is_noted_where_it_is(tmp_path):
     assert parse(tmp_path).metadata["ground_truth"] is None
     write_image(tmp_path / "ground_truth/masks/v01.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     write_image(tmp_path / "ground_truth/silhouettes/cup/v02.png", np.zeros((HEIGHT, WIDTH), np.uint8))
-    write_image(tmp_path / "ground_truth/seen/cup/v02.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     truth = parse(tmp_path).metadata["ground_truth"]
-    assert truth["seen"] == {"cup": [None, tmp_path / "ground_truth/seen/cup/v02.png"] + [None] * 5}
     assert truth["masks"] == [tmp_path / "ground_truth/masks/v01.png"] + [None] * 6
     assert truth["silhouettes"] == {"cup": [None, tmp_path / "ground_truth/silhouettes/cup/v02.png"] + [None] * 5}
 
