@@ -55,8 +55,8 @@ def run_demo(
     from beags_plugin.commands.made_masks import SALIENT, ChosenSource
     from beags_plugin.commands.scene_setup import MadeScene, made_scene, name_of
     from beags_plugin.data.layout import read_dataset
-    from beags_plugin.data.quick import quick_downscale
     from beags_plugin.sample.writer import SampleConfig, make_sample
+    from beags_plugin.views.quick import quick_downscale
 
     again = Again(data, output, preset, downscale, objects, pick, mask_source, mask_options, seed)
     preset = preset or (PRESET if data is None else PRESET_OF_PHOTOS)

@@ -10,43 +10,38 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from data_folders import write_image
+from data_folders import write_image, write_transforms
 from run_folders import write_scene
 
 from beags_plugin.commands import demo, demo_training
 from beags_plugin.commands.cli import main
 from beags_plugin.commands.demo import check_preset
 from beags_plugin.commands.demo_training import STAMP, trained
-from beags_plugin.data.quick import QUICK_PIXELS, quick_downscale
 from beags_plugin.plugin.options.config import base_config
 from beags_plugin.sample import writer
 from beags_plugin.system.errors import UserError
+from beags_plugin.views.quick import QUICK_PIXELS, quick_downscale
 
 
 def test_large_images_are_scaled_down_by_a_whole_factor(tmp_path):
-    assert quick_downscale(tmp_path) == 1.0
-    for folder, file in (("below", "images/left/a.png"), ("posed", "photos/a.png")):
-        write_image(tmp_path / folder / file, np.zeros((300, 400), np.uint8))
-    (tmp_path / "posed/transforms.json").write_text(json.dumps({"frames": [{"file_path": "photos/a.png"}]}))
-    assert quick_downscale(tmp_path / "below") == 2.0  # 200 x 150 are 30,000 pixels
-    assert quick_downscale(tmp_path / "posed") == 2.0
+    assert quick_downscale(tmp_path) == 1.0  # it cannot be read
+    write_transforms(tmp_path)
+    for path in (tmp_path / "images").iterdir():
+        write_image(path, np.zeros((240, 400), np.uint8))
+    assert quick_downscale(tmp_path) == 2.0  # 200 x 120 are 24,000 pixels
+    (tmp_path / "images/v00.png").write_text("no picture")
+    with pytest.raises(UserError, match="cannot be read as an image"):
+        quick_downscale(tmp_path)
 
 
 def test_the_images_that_the_layout_takes_decide(tmp_path):
     """LLFF takes the largest copies, not those whose folder comes first by name."""
-    for name, shape in (("images_8/a.png", (750, 1000)), ("images_16/a.png", (375, 500))):
-        write_image(tmp_path / name, np.zeros(shape, np.uint8))
-    assert quick_downscale(tmp_path) == 2.0  # 250 x 187 are 46,750 pixels
-    pose = np.column_stack([np.eye(3), [0.0, 0.0, 0.0], [1500.0, 2000.0, 1800.0]])
-    np.save(tmp_path / "poses_bounds.npy", np.concatenate([pose.ravel(), [1.0, 2.0]])[None])
-    assert quick_downscale(tmp_path) == 4.0
-
-
-def test_an_image_that_cannot_be_read_is_a_user_error(tmp_path):
-    (tmp_path / "images").mkdir()
-    (tmp_path / "images/a.png").write_text("no picture")
-    with pytest.raises(UserError, match="cannot be read as an image"):
-        quick_downscale(tmp_path)
+    for name in ("a", "b"):
+        for folder, shape in (("images_8", (750, 1000)), ("images_16", (375, 500))):
+            write_image(tmp_path / f"{folder}/{name}.png", np.zeros(shape, np.uint8))
+    poses = [np.column_stack([np.eye(3), [x, 0.0, 0.0], [1500.0, 2000.0, 1800.0]]) for x in (0.0, 1.0)]
+    np.save(tmp_path / "poses_bounds.npy", np.array([[*pose.ravel(), 1.0, 2.0] for pose in poses]))
+    assert quick_downscale(tmp_path) == 4.0  # 250 x 187 are 46,750 pixels
 
 
 def test_only_presets_of_both_phases_make_a_demo():

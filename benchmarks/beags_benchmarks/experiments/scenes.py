@@ -115,7 +115,7 @@ def given_scenes(folders: Sequence[Path], downscale: float | None) -> list[Trial
 
     Raises ``UserError`` for a folder that does not exist, and for two of one name.
     """
-    from beags_plugin.data.quick import quick_downscale
+    from beags_plugin.views.quick import quick_downscale
 
     scenes = []
     for folder in folders:

@@ -15,10 +15,10 @@ from beags_benchmarks.experiments.paper.data_sets import PaperDataSet
 from beags_benchmarks.experiments.scenes import SceneSize, TrialScene, quiet
 from beags_plugin.data import LAYOUTS
 from beags_plugin.data.files import image_size, list_images
-from beags_plugin.data.quick import QUICK_PIXELS
 from beags_plugin.system.digests import folder_digest
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.whole_files import write_text_atomically
+from beags_plugin.views.quick import QUICK_PIXELS
 
 TRUTH = "ground_truth"
 
