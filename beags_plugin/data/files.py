@@ -79,18 +79,10 @@ def largest_images(root: Path, chosen: Path | None = None) -> tuple[Path, float]
     return folders[0], max(image_width(folders[0]) / LARGEST_WIDTH, 1.0)
 
 
-def size_note(folder: Path, size: str = "as they are, as in the paper") -> str:
-    """Return a sentence on the size of the images that a layout has chosen. size: compared with the paper's."""
+def size_note(folder: Path, downscale: float = 1.0) -> str:
+    """Return a sentence on the size of the images that a layout has chosen."""
     others = "other sizes: beags-data --images-path FOLDER or --downscale-factor N"
-    return f"The images of {folder.name} are used {size} ({others})."
-
-
-def width_note(folder: Path) -> str:
-    """Return ``size_note`` for the images of ``largest_images``, which are never enlarged."""
-    width = image_width(folder)
-    if width < LARGEST_WIDTH:
-        return size_note(folder, f"as they are, {width} pixels wide, narrower than the paper's {LARGEST_WIDTH}")
-    return size_note(folder, f"{LARGEST_WIDTH} pixels wide, as in the paper")
+    return f"The images of {folder.name} are used {round(image_width(folder) / downscale)} pixels wide ({others})."
 
 
 def numbered(files: Sequence[Path], count: int) -> tuple[list[int] | None, tuple[Path, ...]]:

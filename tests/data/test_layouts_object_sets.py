@@ -26,7 +26,7 @@ def test_lerf_mask(tmp_path, capsys):
     }
     said = " ".join(capsys.readouterr().out.split())
     assert "Exact masks of 'green apple', 'old camera' do not count" in said
-    assert "The images of images are used as they are, as in the paper (other sizes: " in said
+    assert "The images of images are used 20 pixels wide (other sizes: " in said
     (tmp_path / "classes.json").write_text('{"37": "green apple", "4": "old camera"}')
     assert parse(tmp_path).metadata["classes"][37] == "green apple"
     assert "do not count" not in capsys.readouterr().out
@@ -59,7 +59,7 @@ def test_3dovs(tmp_path, capsys):
     test = parse(tmp_path, "test")
     assert names(test) == ["00", "04"] and names(parse(tmp_path)) == [stems[i] for i in (1, 2, 3, 5)]
     said = " ".join(capsys.readouterr().out.split())
-    assert "The images of images are used as they are, 20 pixels wide, narrower than the paper's 1600 (" in said
+    assert "The images of images are used 20 pixels wide (" in said
     assert test.metadata["classes"] == {0: "background", 1: "red bag", 2: "banana", 3: "white sheet"}
     assert test.metadata["ground_truth"]["visible"]["banana"] == [
         tmp_path / f"segmentations/{view}/banana.png" for view in ("00", "04")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from beags_plugin.data.dataset import ColmapModel, Dataset, PoseTable
-from beags_plugin.data.files import largest_images, width_note
+from beags_plugin.data.files import largest_images, size_note
 from beags_plugin.data.layout import Layout
 from beags_plugin.data.layouts.colmap import complete_model, points_file
 from beags_plugin.data.poses_bounds import FILE, read_poses_bounds
@@ -30,7 +30,7 @@ class Llff(Layout):
     def read(self, root: Path, images: Path | None) -> Dataset:
         folder, downscale = largest_images(root, images)
         poses, points = model_or_bounds(root, folder)
-        note = "" if images else width_note(folder)
+        note = "" if images else size_note(folder, downscale)
         return Dataset(self.title, root, poses, seed_points=points, downscale=downscale, size_note=note)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from beags_plugin.data.dataset import ColmapModel, Dataset
-from beags_plugin.data.files import choose_images, image_folders, image_width, list_images, size_note
+from beags_plugin.data.files import choose_images, image_folders, list_images, size_note
 from beags_plugin.data.layouts.colmap import Colmap, checked_model
 
 SCENES = ("bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill")
@@ -31,12 +31,6 @@ class MipNerf360(Colmap):
 
     def read(self, root: Path, images: Path | None) -> Dataset:
         quarter = root / QUARTER
-        if images is not None:
-            folder, note = choose_images(root, images), ""
-        elif list_images(quarter):
-            folder, note = quarter, size_note(quarter)
-        else:
-            folder = choose_images(root)
-            width = f"{image_width(folder)} pixels wide, as there is no {QUARTER}, which the paper uses"
-            note = size_note(folder, f"as they are, {width}")
+        folder = choose_images(root, images or (quarter if list_images(quarter) else None))
+        note = "" if images else size_note(folder)
         return Dataset(self.title, root, ColmapModel(checked_model(root), folder), size_note=note)

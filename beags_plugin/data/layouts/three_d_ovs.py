@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from beags_plugin.data.dataset import Dataset, Split
-from beags_plugin.data.files import largest_images, list_images, width_note
+from beags_plugin.data.files import largest_images, list_images, size_note
 from beags_plugin.data.layout import Layout, stem_of
 from beags_plugin.data.layouts.llff import lacks_poses, model_or_bounds
 from beags_plugin.system.errors import UserError
@@ -53,7 +53,7 @@ class ThreeDOvs(Layout):
             visible=visible,
             seed_points=points,
             downscale=downscale,
-            size_note="" if images else width_note(folder),
+            size_note="" if images else size_note(folder, downscale),
         )
 
 
