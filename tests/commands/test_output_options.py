@@ -11,7 +11,7 @@ import tyro
 
 from beags_plugin.commands import cli, masks
 
-BENCH = ("ablation", "file", "paper", "captures", "sample") if "bench" in cli.COMMANDS.names() else ()
+BENCH = ("ablation", "file", "paper", "captures", "sample", "nvos") if "bench" in cli.COMMANDS.names() else ()
 WORDS = [
     *([command.__name__.lower()] for command in typing.get_args(cli.Command) if command.__name__ != "Masks"),
     *(["masks", action.__name__.lower()] for action in (masks.Agree, masks.Check, masks.Make, masks.Reproject)),
