@@ -74,7 +74,13 @@ def test_each_scene_is_trained_as_its_data_set_says(finished):
     assert len(requests) == 6
     by_layout = {request["options"]["layout"]: request["options"] for request in requests}
     assert by_layout == {
-        "llff": {"layout": "llff", "images_path": "images", "masks_path": "masks", "eval_interval": 8},
+        "llff": {
+            "layout": "llff",
+            "images_path": "images",
+            "masks_path": "masks",
+            "eval_interval": 8,
+            "held_out": ["IMG_4027"],
+        },  # fmt: skip
         "lerf-mask": {"layout": "lerf-mask", "images_path": "images", "masks_path": "masks"},
     }
 

@@ -103,7 +103,7 @@ def find_scene(data_set: PaperDataSet, name: str, folder: Path, output: Path, si
     if data_set.eval_interval is not None:
         options["eval_interval"] = data_set.eval_interval
     if name in data_set.held_out:
-        options["held_out"] = (data_set.held_out[name],)
+        options["held_out"] = [data_set.held_out[name]]
     try:
         factor = sizes.factor(data_set, photos[0])
         digest = folder_digest(folder, without=folder / TRUTH)
