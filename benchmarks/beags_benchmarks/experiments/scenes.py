@@ -92,8 +92,8 @@ def scene_size(scene: TrialScene) -> SceneSize:
 
 def parser_options(plain: Mapping[str, Any]) -> dict[str, Any]:
     """Return plain options of ``beags-data`` with their paths as ``Path`` and lists as tuples."""
-    options = {name: tuple(value) if isinstance(value, list) else value for name, value in plain.items()}
-    return {name: Path(value) if name.endswith("_path") else value for name, value in options.items()}
+    lists = {name: tuple(value) for name, value in plain.items() if isinstance(value, list)}
+    return {name: Path(value) if name.endswith("_path") else value for name, value in plain.items()} | lists
 
 
 def sample_scene(folder: Path, family: str, seed: int, options: Mapping[str, Any], write: bool = True) -> TrialScene:

@@ -80,7 +80,7 @@ def test_each_scene_is_trained_as_its_data_set_says(finished):
             "masks_path": "masks",
             "eval_interval": 8,
             "held_out": ["IMG_4027"],
-        },  # fmt: skip
+        },
         "lerf-mask": {"layout": "lerf-mask", "images_path": "images", "masks_path": "masks"},
     }
 
