@@ -15,7 +15,7 @@ from beags_plugin.system.open3d_kernels import open3d_kernels
 GAP = 2  # texels between charts, which are filled with the colours of the nearest texel in a chart
 SMALLEST = 128  # least side of an image whose size is chosen here
 _LEAST = 0.8  # least share of the required side, so that a small excess does not double the power of two
-_ROWS = 256  # rows of texels that are looked up at a time
+_RAYS = 1 << 17  # texels that are looked up at a time
 
 
 @dataclass(frozen=True)
@@ -34,19 +34,26 @@ class Atlas:
 
 @dataclass(frozen=True)
 class Texels:
-    """The T texels whose centre lies in a chart: rows, columns [T] int64, and their places on the mesh.
+    """The T texels whose centre lies in a chart: rows, columns [T] int32, and their places on the mesh.
 
-    corners: [T, 3] int64, the mesh's vertices of their face. weights: [T, 3] float64, the weights of these.
+    faces: [T] int32, the rows of ``corners`` [F, 3] int64, the mesh's vertices. uvs: [T, 2] float32, Open3D's
+    coordinates in the face.
     """
 
     rows: np.ndarray
     columns: np.ndarray
+    faces: np.ndarray
+    uvs: np.ndarray
     corners: np.ndarray
-    weights: np.ndarray
 
     def of(self, values: np.ndarray) -> np.ndarray:
         """Return [T, d] float64, ``values`` [V, d] of the mesh's vertices interpolated."""
-        return np.einsum("tc,tcd->td", self.weights, values[self.corners])
+        result = np.empty((len(self.faces), values.shape[1]))
+        for first in range(0, len(result), _RAYS):
+            part = slice(first, first + _RAYS)
+            of_corners = values[self.corners[self.faces[part]]]
+            np.einsum("tc,tcd->td", corner_weights(self.uvs[part]), of_corners, out=result[part])
+        return result
 
 
 def unwrapped(mesh: Mesh, size: int, density: float = 0.0) -> Atlas:
@@ -83,19 +90,18 @@ def texels(atlas: Atlas) -> Texels:
     scene, tensor = open3d.t.geometry.RaycastingScene(), open3d.core.Tensor
     flat = np.concatenate([atlas.size * atlas.uv, np.zeros((len(atlas.uv), 1))], axis=1)
     scene.add_triangles(tensor(flat.astype(np.float32)), tensor(atlas.faces.astype(np.uint32)))
-    columns = np.arange(atlas.size) + 0.5
+    columns, height = np.arange(atlas.size) + 0.5, max(1, _RAYS // atlas.size)
     strips = []
-    for first in range(0, atlas.size, _ROWS):
-        rows = np.arange(first, min(first + _ROWS, atlas.size)) + 0.5
+    for first in range(0, atlas.size, height):
+        rows = np.arange(first, min(first + height, atlas.size)) + 0.5
         rays = np.zeros((len(rows), len(columns), 6), np.float32)
         rays[..., 0], rays[..., 1], rays[..., 2], rays[..., 5] = columns, rows[:, None], 1.0, -1.0
         hit = scene.cast_rays(tensor(rays))
         in_chart = np.isfinite(hit["t_hit"].numpy())
         row, column = np.nonzero(in_chart)
-        face = hit["primitive_ids"].numpy()[in_chart].astype(np.int64)
-        weights = corner_weights(hit["primitive_uvs"].numpy()[in_chart])
-        strips.append((row + first, column, atlas.source[atlas.faces[face]], weights))
-    return Texels(*(np.concatenate(each) for each in zip(*strips, strict=True)))
+        face, uvs = hit["primitive_ids"].numpy()[in_chart], hit["primitive_uvs"].numpy()[in_chart]
+        strips.append(((row + first).astype(np.int32), column.astype(np.int32), face.astype(np.int32), uvs))
+    return Texels(*(np.concatenate(each) for each in zip(*strips, strict=True)), atlas.source[atlas.faces])
 
 
 def picture(atlas: Atlas, at: Texels, colors: np.ndarray) -> np.ndarray:

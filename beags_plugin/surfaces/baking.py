@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,6 +24,7 @@ _SHARPEN = 3  # power of a view's weight: a higher one follows the best view, a 
 _PRIOR = 1e-6  # weight of the splats' colour; a photo that faces a place with one pixel per texel has 1
 _SAMPLES = 8000  # places at which exposures are compared
 _ALIKE = 0.05  # standard deviation of log exposures below which they may be errors of the surface
+_PART = 1 << 16  # places that are looked up at a time, so that memory hardly grows with their number
 
 
 @dataclass(frozen=True)
@@ -69,41 +70,77 @@ def baked(
     some = places[::step]
     observed = (places_seen(some, mesh, caster, photo) for photo in photos)
     exposures = exposures_of(len(some.points), len(photos), observed, lambda done: progress(done, 2 * len(photos)))
-    total = _PRIOR * linear_from_srgb(prior)
-    weights = np.full(len(places.points), _PRIOR)
+    colors, weights = np.empty(places.points.shape), np.full(len(places.points), _PRIOR)
+    for part in _parts(len(colors)):  # ``colors`` holds weighted sums of light until the end.
+        colors[part] = _PRIOR * linear_from_srgb(prior[part])
     for done, (photo, exposure) in enumerate(zip(photos, exposures, strict=True), start=1):
-        index, light, weight = places_seen(places, mesh, caster, photo)
-        total[index] += weight[:, None] * light / exposure
-        weights[index] += weight
+        for index, light, weight in _observed(places, mesh, caster, photo):
+            colors[index] += weight[:, None] * light / exposure
+            weights[index] += weight
         progress(len(photos) + done, 2 * len(photos))
-    return Baked(srgb_from_linear(total / weights[:, None]), weights > _PRIOR, exposures)
+    for part in _parts(len(colors)):
+        colors[part] = srgb_from_linear(colors[part] / weights[part, None])
+    return Baked(colors, weights > _PRIOR, exposures)
 
 
 def places_seen(places: Places, mesh: Mesh, caster: Any, photo: Photo) -> Observations:
     """Return the places that a photo shows, [M] int64, their light [M, 3] and its weights [M]."""
-    camera = photo.camera
-    xy, z = (values.numpy() for values in project(torch.from_numpy(places.points), camera.to(torch.float64)))
-    towards = camera.center.double().numpy() - places.points
-    distance = np.sqrt(np.einsum("pd,pd->p", towards, towards))
-    cosine = np.einsum("pd,pd->p", towards, places.normals) / np.maximum(distance, 1e-300)
-    with np.errstate(invalid="ignore"):
-        framed = ((xy >= 0.5) & (xy <= [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
-    index = np.flatnonzero(framed & (z > 0) & (cosine > FLATTEST))
-    column, row = np.floor(xy[index]).astype(np.int64).T
-    column, row = np.minimum(column, camera.width - 1), np.minimum(row, camera.height - 1)
-    depth = photo.depth().numpy()[row, column]
-    index = index[well_inside(photo)[row, column] & ~hides(depth, z[index])]
-    index = index[~_hidden(caster, mesh, places[index], camera.center.double().numpy())]
-    light = linear_from_srgb(interpolated(photo.image(), xy[index]))
-    pixels = cosine[index] * (camera.focal * places.spacing / z[index]) ** 2  # pixels per place
-    return index, light, np.minimum(pixels, 4.0) ** _SHARPEN
+    nothing = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0)
+    index, light, weight = zip(nothing, *_observed(places, mesh, caster, photo), strict=True)
+    return np.concatenate(index), np.concatenate(light), np.concatenate(weight)
+
+
+def _observed(places: Places, mesh: Mesh, caster: Any, photo: Photo) -> Iterator[Observations]:
+    """Yield ``places_seen`` part by part."""
+    camera, inside = photo.camera, well_inside(photo)
+    depth, image = photo.depth().numpy(), photo.image()
+    center, precise = camera.center.double().numpy(), camera.to(torch.float64)
+    for chosen in _parts(len(places.points)):
+        part = places[chosen]
+        towards = center - part.points
+        distance = np.sqrt(np.einsum("pd,pd->p", towards, towards))
+        cosine = np.einsum("pd,pd->p", towards, part.normals) / np.maximum(distance, 1e-300)
+        index = np.flatnonzero(cosine > FLATTEST)  # This leaves out most places at the least cost.
+        xy, z = (values.numpy() for values in project(torch.from_numpy(part.points[index]), precise))
+        with np.errstate(invalid="ignore"):
+            framed = ((xy >= 0.5) & (xy <= [camera.width - 0.5, camera.height - 0.5])).all(axis=1) & (z > 0)
+        index, xy, z = index[framed], xy[framed], z[framed]
+        column, row = np.floor(xy).astype(np.int64).T
+        column, row = np.minimum(column, camera.width - 1), np.minimum(row, camera.height - 1)
+        open_ = inside[row, column]
+        open_[open_] = ~hides(depth[row[open_], column[open_]], z[open_])
+        index, xy, z = index[open_], xy[open_], z[open_]
+        if not len(index):
+            continue
+        open_ = ~_hidden(caster, mesh, part[index], center)
+        index, xy, z = index[open_], xy[open_], z[open_]
+        light = linear_from_srgb(interpolated(image, xy))
+        pixels = cosine[index] * (camera.focal * places.spacing / z) ** 2  # pixels per place
+        yield chosen.start + index, light, np.minimum(pixels, 4.0) ** _SHARPEN
+
+
+def _parts(count: int) -> Iterator[slice]:
+    return (slice(first, first + _PART) for first in range(0, count, _PART))
 
 
 def well_inside(photo: Photo) -> np.ndarray:
     """Return [H, W] bool, the pixels of a photo's mask without its edge, where colours mix with those behind."""
-    edge = photo.edge
-    around = torch.nn.functional.pad((~photo.own()).float()[None, None], (edge, edge, edge, edge))
-    return (torch.nn.functional.max_pool2d(around, 2 * edge + 1, stride=1)[0, 0] == 0).numpy()
+    return without_edge(photo.own().numpy(), photo.edge)
+
+
+def without_edge(mask: np.ndarray, edge: int) -> np.ndarray:
+    """Return the pixels of a mask [H, W] bool around which a square of 2 ``edge`` + 1 pixels lies in it.
+
+    Beyond the image everything counts as the mask's. The squares are made by doubling: time grows with their logarithm.
+    """
+    mask, side = np.pad(mask, edge, constant_values=True), 2 * edge + 1
+    width = 1
+    while width < side:
+        step = min(width, side - width)
+        mask = mask[step:] & mask[:-step]
+        mask = mask[:, step:] & mask[:, :-step]
+        width += step
+    return mask
 
 
 def _hidden(caster: Any, mesh: Mesh, places: Places, center: np.ndarray) -> np.ndarray:
@@ -119,7 +156,7 @@ def _hidden(caster: Any, mesh: Mesh, places: Places, center: np.ndarray) -> np.n
 def interpolated(image: Tensor, xy: np.ndarray) -> np.ndarray:
     """Return an image [H, W, 3] at pixel coordinates [M, 2], bilinearly interpolated; [M, 3] float64."""
     height, width = image.shape[:2]
-    pixels = image.double().numpy()
+    pixels = image.numpy()
     at = xy - 0.5
     first = np.clip(np.floor(at).astype(np.int64), 0, [max(width - 2, 0), max(height - 2, 0)])
     (x, y), (u, v) = first.T, np.clip(at - first, 0.0, 1.0).T[..., None]

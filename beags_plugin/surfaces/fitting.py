@@ -25,7 +25,7 @@ from beags_plugin.surfaces.item import Photo
 from beags_plugin.surfaces.surface import corner_weights, rays_through, surface_of
 
 _RAYS = 0.25 * np.array([[1.0, 1.0], [3.0, 1.0], [1.0, 3.0], [3.0, 3.0]])  # positions of rays in a pixel
-_MOST = 1_000_000  # pixels of all photos, about 400 bytes each; with more, the mean is sharp enough
+_MOST = 1_000_000  # pixels of all photos, about 200 bytes each; with more, the mean is sharp enough
 _HOLD = 0.2  # weight of the mean, in photos' pixels (chosen on tabletop 0 and room 0: notes/export.md)
 _STEPS = 20  # iterations of the solver; more sharpen more, and amplify noise
 
@@ -43,42 +43,62 @@ def fitted(
     exposures: [V, 3] of the photos, which are divided by them. The image does not change where no photo shows a texel,
     nor at all if more than a million pixels of photos show it. progress: receives (done, total) photos.
     """
-    from scipy.sparse import csr_array
-    from scipy.sparse.linalg import lsmr
+    from scipy.sparse.linalg import LinearOperator, lsmr
     from threadpoolctl import threadpool_limits
 
     if not photos:
         return image
-    caster, columns, shares, colors = surface_of(mesh), [], [], []
-    inside = sum(int(well_inside(photo).sum()) for photo in photos)
-    if inside > _MOST:  # A selection of pixels would sharpen the texture unevenly.
+    inside = 0
+    for photo in photos:
+        inside += int(well_inside(photo).sum())
+        if inside > _MOST:  # A selection of pixels would sharpen the texture unevenly.
+            return image
+    matrix, target, used = _system(atlas, mesh, photos, exposures, progress)
+    if not len(target):
         return image
-    for done, (photo, exposure) in enumerate(zip(photos, exposures, strict=True), start=1):
-        of_pixels, weights, pixels = _pixels(photo, atlas, mesh, caster)
-        columns.append(of_pixels)
-        shares.append(weights)
-        colors.append(srgb_from_linear(linear_from_srgb(pixels) / exposure))
-        progress(done, len(photos))
-    column, target = np.concatenate(columns), np.concatenate(colors)
-    if not len(column):
-        return image
-    visible = np.zeros(atlas.size**2, bool)
-    visible[column] = True
-    used = np.flatnonzero(visible)
-    rank = np.cumsum(visible, dtype=np.int32) - 1
-    starts = np.arange(0, column.size + 1, column.shape[1])
-    matrix: Any = csr_array(
-        (np.concatenate(shares).reshape(-1), rank[column].reshape(-1), starts), shape=(len(column), len(used))
-    )
-    matrix.sum_duplicates()
+    # SciPy would copy the matrix for each product with it, to convert it, and for its transpose.
+    operator = LinearOperator(matrix.shape, matvec=matrix.dot, rmatvec=matrix.T.dot, dtype=np.float64)
     texels = image.reshape(-1, 3)[used] / 255.0
     with threadpool_limits(1, "blas"):
         for channel in range(3):
             missing = target[:, channel] - matrix @ texels[:, channel]
-            texels[:, channel] += lsmr(matrix, missing, damp=math.sqrt(_HOLD), atol=0, btol=0, maxiter=_STEPS)[0]
+            texels[:, channel] += lsmr(operator, missing, damp=math.sqrt(_HOLD), atol=0, btol=0, maxiter=_STEPS)[0]
     new = image.reshape(-1, 3).copy()
     new[used] = np.round(255.0 * np.clip(texels, 0.0, 1.0))
     return new.reshape(image.shape)
+
+
+def _system(
+    atlas: Atlas,
+    mesh: Mesh,
+    photos: Sequence[Photo],
+    exposures: np.ndarray,
+    progress: Callable[[int, int], None],
+) -> tuple[Any, np.ndarray, np.ndarray]:
+    """Return the sparse matrix [M, U] float64 that makes pixels of texels, the pixels [M, 3], and the texels [U] used.
+
+    Pixels have the mean exposure, texels are numbered row by row.
+    """
+    from scipy.sparse import csr_array
+
+    caster, blocks, pixels = surface_of(mesh), [], []
+    for done, (photo, exposure) in enumerate(zip(photos, exposures, strict=True), start=1):
+        columns, shares, colors = _pixels(photo, atlas, mesh, caster)
+        starts = np.arange(0, columns.size + 1, columns.shape[1], dtype=np.int32)
+        block: Any = csr_array((shares.reshape(-1), columns.reshape(-1), starts), shape=(len(columns), atlas.size**2))
+        block.sum_duplicates()  # A pixel's rays mostly share texels.
+        blocks.append((block.data.copy(), block.indices.copy(), np.diff(block.indptr)))
+        pixels.append(srgb_from_linear(linear_from_srgb(colors) / exposure))
+        progress(done, len(photos))
+    data, columns, counts = (np.concatenate(each) for each in zip(*blocks, strict=True))
+    del blocks
+    target = np.concatenate(pixels)
+    visible = np.zeros(atlas.size**2, bool)
+    visible[columns] = True
+    columns = (np.cumsum(visible, dtype=np.int32) - 1)[columns]
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    used = np.flatnonzero(visible)
+    return csr_array((data.astype(np.float64), columns, starts), shape=(len(target), len(used))), target, used
 
 
 def _pixels(photo: Photo, atlas: Atlas, mesh: Mesh, caster: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -100,7 +120,7 @@ def _pixels(photo: Photo, atlas: Atlas, mesh: Mesh, caster: Any) -> tuple[np.nda
     face = hit["primitive_ids"].numpy()[rays_of].astype(np.int64)
     uv = np.einsum("pc,pcd->pd", corner_weights(hit["primitive_uvs"].numpy()[rays_of]), atlas.uv[atlas.faces[face]])
     columns, shares = _between(uv, atlas.size)
-    pixels = photo.image().double().numpy()[rows[whole], cols[whole]]
+    pixels = photo.image().numpy()[rows[whole], cols[whole]].astype(np.float64)
     shape = (len(pixels), 4 * len(_RAYS))
     return columns.reshape(shape), (shares / len(_RAYS)).astype(np.float32).reshape(shape), pixels
 

@@ -42,6 +42,14 @@ def textured(mesh: Mesh, photos: Sequence[Photo], size: int) -> Texture:
     photos = [photo.sharper or photo for photo in photos]
     density = 0.0 if size else suitable_density(mesh, photos)
     atlas = unwrapped(mesh, LARGEST, density) if density else unwrapped(mesh, size or SMALLEST)
+    image, seen, exposures = _mean(mesh, photos, atlas)
+    with progress_bar("Texture fitted to photos", passing=True) as progress:
+        image = fitted(image, atlas, mesh, photos, exposures, progress)
+    return Texture(atlas, image, seen, exposures)
+
+
+def _mean(mesh: Mesh, photos: Sequence[Photo], atlas: Atlas) -> tuple[np.ndarray, float, np.ndarray]:
+    """Return the mean of photos as a texture's image, the share of texels that they show, and their exposures."""
     at = texels(atlas)
     normals = at.of(vertex_normals(mesh))
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -49,10 +57,7 @@ def textured(mesh: Mesh, photos: Sequence[Photo], size: int) -> Texture:
     places = Places(at.of(mesh.vertices), normals, math.sqrt(area / max(len(at.rows), 1)))
     with progress_bar("Colours from photos", passing=True) as progress:
         mean = baked(places, mesh, photos, at.of(mesh.colors), progress)
-    image = picture(atlas, at, mean.colors)
-    with progress_bar("Texture fitted to photos", passing=True) as progress:
-        image = fitted(image, atlas, mesh, photos, mean.exposures, progress)
-    return Texture(atlas, image, float(mean.seen.mean()) if len(mean.seen) else 0.0, mean.exposures)
+    return picture(atlas, at, mean.colors), float(mean.seen.mean()) if len(mean.seen) else 0.0, mean.exposures
 
 
 def suitable_density(mesh: Mesh, photos: Sequence[Photo]) -> float:

@@ -16,7 +16,7 @@ from photographed_box import EXPOSURES, EYES, VOXEL, a_box, camera_from, light_a
 
 from beags_plugin.export.glb import glb_bytes
 from beags_plugin.surfaces.atlas import picture, texels, unwrapped
-from beags_plugin.surfaces.baking import Places, baked
+from beags_plugin.surfaces.baking import Places, baked, without_edge
 from beags_plugin.surfaces.color import linear_from_srgb, srgb_from_linear
 from beags_plugin.surfaces.fusion import Mesh, decimated
 from beags_plugin.surfaces.item import Photo
@@ -50,6 +50,27 @@ def test_exposures_are_evened_out_and_colours_are_those_of_the_places(box):
     right = srgb_from_linear(light_at(places.points) * np.exp(np.log(EXPOSURES).mean()))
     assert np.abs(found.colors - right)[found.seen].mean() < 0.005
     assert np.abs(found.colors[below] - 0.9).max() < 1e-6  # No photo shows these, so the splats' colour stays.
+
+
+def test_parts_of_a_surface_have_the_same_colours_as_the_whole(box, monkeypatch):
+    places, prior = places_of(box), np.random.default_rng(0).random((len(box.faces), 3))
+    whole, at = baked(places, box, photos_of(box), prior), texels(unwrapped(box, 128))
+    corners = at.of(box.vertices)
+    monkeypatch.setattr("beags_plugin.surfaces.baking._PART", 7)
+    monkeypatch.setattr("beags_plugin.surfaces.atlas._RAYS", 1000)
+    parts, again = baked(places, box, photos_of(box), prior), texels(unwrapped(box, 128))
+    assert whole.seen.any() and not whole.seen.all() and np.array_equal(parts.seen, whole.seen)
+    assert np.abs(parts.colors - whole.colors).max() < 1e-12
+    assert np.abs(again.of(box.vertices) - corners).max() < 1e-12
+    assert np.array_equal(again.rows, at.rows) and np.array_equal(again.columns, at.columns)
+
+
+@pytest.mark.parametrize("edge", range(6))
+def test_the_edge_of_a_mask_is_as_wide_as_given(edge):
+    mask = np.random.default_rng(edge).random((40, 30)) < 0.97
+    around = np.pad(mask, edge, constant_values=True)
+    windows = np.lib.stride_tricks.sliding_window_view(around, (2 * edge + 1, 2 * edge + 1))
+    assert np.array_equal(without_edge(mask, edge), windows.all(axis=(2, 3)))
 
 
 def test_what_stands_before_the_object_leaves_no_colour(box):
