@@ -73,9 +73,12 @@ def add_mesh(
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """Return an image [H, W, 3] uint8 as a .png."""
+    """Return an image [H, W, 3] uint8 as a .png.
+
+    Pillow's ``optimize`` would take five times as long for a file 3 % smaller.
+    """
     from PIL import Image
 
     file = io.BytesIO()
-    Image.fromarray(image).save(file, format="PNG", optimize=True)
+    Image.fromarray(image).save(file, format="PNG")
     return file.getvalue()
