@@ -6,6 +6,7 @@ it fully.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -36,6 +37,8 @@ def starting(command: Any, nerfstudio: bool = False) -> Iterator[None]:
     viewer. Raises ``UserError``.
     """
     check_arguments(command)
+    if not nerfstudio:  # Threads that wait actively shorten the many small steps of training, and only those.
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # torch's OpenMP reads it when it is loaded
     if nerfstudio and find_spec("nerfstudio") is None:
         raise UserError(
             f"beags {type(command).__name__.lower()} needs nerfstudio, which is not installed here: "

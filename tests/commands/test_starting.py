@@ -11,8 +11,8 @@ import sys
 import pytest
 from run_folders import write_scene, write_trained
 
-from beags_plugin.commands.cli import main
-from beags_plugin.commands.starting import run_config
+from beags_plugin.commands.cli import Doctor, main
+from beags_plugin.commands.starting import run_config, starting
 from beags_plugin.system.errors import UserError, check_choice
 
 pytest.importorskip("nerfstudio")
@@ -98,3 +98,44 @@ def test_the_nearest_choice_is_named_whatever_its_case():
     ):
         check_choice("Milk", ["milk", "lemon"], "object", " in it")
     check_choice("milk", ["milk"], "object")
+
+
+END = """
+import atexit, sys, types
+from beags_plugin.commands import cli
+
+class Late:
+    def __del__(self):
+        print("destroyed")
+
+late = Late()
+for name in sys.argv[1:]:
+    sys.modules[name] = types.ModuleType(name)
+atexit.register(print, "at exit")
+print("work", end=" ")
+cli.end_process()
+"""
+
+
+@pytest.mark.parametrize(
+    ("loaded", "said"),
+    [
+        (["torch"], "work at exit\n"),
+        (["torch", "nerfstudio"], "work at exit\ndestroyed\n"),
+        ([], "work at exit\ndestroyed\n"),
+    ],
+)
+def test_a_process_with_torch_alone_ends_without_destructors(loaded, said):
+    done = subprocess.run([sys.executable, "-c", END, *loaded], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == (said, "")
+
+
+@pytest.mark.parametrize(("training", "policy"), [(False, "PASSIVE"), (True, None)])
+def test_threads_of_commands_that_do_not_train_wait_passively(monkeypatch, training, policy):
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    with starting(Doctor(), training):
+        assert os.environ["OMP_WAIT_POLICY"] == "ACTIVE"  # The user's choice stands.
+    monkeypatch.delenv("OMP_WAIT_POLICY")
+    with starting(Doctor(), training):
+        assert os.environ.get("OMP_WAIT_POLICY") == policy
+    monkeypatch.setenv("OMP_WAIT_POLICY", "")  # restored at the end, which deletes what ``starting`` set
