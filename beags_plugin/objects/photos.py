@@ -46,6 +46,12 @@ class _Kept:
             self._values[name, view] = made = made.clone()  # a view would keep its whole picture in memory
         return made
 
+    def drop(self, name: str) -> None:
+        """Forget the tensors of one name, which are made again when they are used."""
+        for key in [key for key in self._values if key[0] == name]:
+            dropped = self._values.pop(key)
+            self._bytes -= dropped.numel() * dropped.element_size()
+
 
 def photos_of(shown: ShownScene, class_id: int | None, part: Surfels, frame: Frame) -> Sequence[Photo]:
     """Return the photos of a class (None: of all classes) in ``frame``; images, masks and depth are read when used.
@@ -63,8 +69,10 @@ def photos_of(shown: ShownScene, class_id: int | None, part: Surfels, frame: Fra
         if box is not None:
             boxes.append((view, box))
     sharp, most = _Kept(), _KEPT / 3 / max(len(boxes), 1)
-    return [_photo(shown, class_id, frame, view, box, kept, _sharper(shown, class_id, frame, view, box, sharp, most))
-            for view, box in boxes]  # fmt: skip
+    return [
+        _photo(shown, class_id, frame, view, box, kept, _sharper(shown, class_id, frame, view, box, kept, sharp, most))
+        for view, box in boxes
+    ]
 
 
 def _photo(
@@ -81,9 +89,12 @@ def _photo(
 
 
 def _sharper(
-    shown: ShownScene, class_id: int | None, frame: Frame, view: int, box: Box, kept: _Kept, most: float
+    shown: ShownScene, class_id: int | None, frame: Frame, view: int, box: Box, coarse: _Kept, kept: _Kept, most: float
 ) -> Photo | None:
-    """Return a part of a photo with at most ``most`` pixels of its file; None if these are hardly more."""
+    """Return a part of a photo with at most ``most`` pixels of its file; None if these are hardly more.
+
+    coarse: what is kept of photos at the size of the training. Their images are dropped once this one is read.
+    """
     if class_id is None:
         return None
     files, index = shown.manager.files["train"], shown.chosen[view]
@@ -101,6 +112,7 @@ def _sharper(
     there = rows.clamp(max=camera.height - 1)[:, None], columns.clamp(max=camera.width - 1)[None]
 
     def read() -> Tensor:
+        coarse.drop("image")
         region = files.full_regions(index, [(left, top, right, bottom)])[0]["image"]
         return torch.from_numpy(resize_area(region.numpy(), *size))
 

@@ -70,6 +70,18 @@ def test_photos_that_were_shrunk_have_sharper_ones(tmp_path):
         )
 
 
+def test_coarse_images_are_dropped_once_a_sharper_one_is_read(tmp_path):
+    found = cup_photos(tmp_path, 4)
+    before = [photo.image() for photo in found]
+    masks = [photo.own() for photo in found]
+    assert all(photo.image() is image for photo, image in zip(found, before, strict=True))
+    assert found[0].sharper is not None
+    found[0].sharper.image()
+    again = [photo.image() for photo in found]
+    assert all(a is not b and torch.equal(a, b) for a, b in zip(again, before, strict=True))
+    assert all(photo.own() is mask for photo, mask in zip(found, masks, strict=True))
+
+
 def test_photos_of_their_files_size_have_none(tmp_path):
     assert all(photo.sharper is None for photo in cup_photos(tmp_path, 1))
 
