@@ -10,7 +10,7 @@ import numpy as np
 
 from beags_plugin.surfaces.fusion import Mesh
 from beags_plugin.surfaces.surface import corner_weights
-from beags_plugin.system.one_processor import one_processor
+from beags_plugin.system.fewer_threads import one_processor
 from beags_plugin.system.open3d_kernels import open3d_kernels
 
 GAP = 2  # texels between charts, which are filled with the colours of the nearest texel in a chart
@@ -103,7 +103,8 @@ def texels(atlas: Atlas) -> Texels:
         row, column = np.nonzero(in_chart)
         face, uvs = hit["primitive_ids"].numpy()[in_chart], hit["primitive_uvs"].numpy()[in_chart]
         strips.append(((row + first).astype(np.int32), column.astype(np.int32), face.astype(np.int32), uvs))
-    return Texels(*(np.concatenate(each) for each in zip(*strips, strict=True)), atlas.source[atlas.faces])
+    row, column, face, uvs = (np.concatenate(each) for each in zip(*strips, strict=True))
+    return Texels(row, column, face, uvs, atlas.source[atlas.faces])
 
 
 def picture(atlas: Atlas, at: Texels, colors: np.ndarray) -> np.ndarray:

@@ -57,7 +57,8 @@ def fitted(
     if not len(target):
         return image
     # SciPy would copy the matrix for each product with it, to convert it, and for its transpose.
-    operator = LinearOperator(matrix.shape, matvec=matrix.dot, rmatvec=matrix.T.dot, dtype=np.float64)
+    products: dict[str, Any] = {"matvec": matrix.dot, "rmatvec": matrix.T.dot}
+    operator = LinearOperator(dtype=np.float64, shape=matrix.shape, **products)
     texels = image.reshape(-1, 3)[used] / 255.0
     with threadpool_limits(1, "blas"):
         for channel in range(3):

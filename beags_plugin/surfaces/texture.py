@@ -16,6 +16,7 @@ from beags_plugin.surfaces.fitting import fitted
 from beags_plugin.surfaces.fusion import Mesh
 from beags_plugin.surfaces.item import Photo
 from beags_plugin.surfaces.surface import area_vectors, vertex_normals
+from beags_plugin.system.fewer_threads import one_torch_thread
 from beags_plugin.system.progress import progress_bar
 
 LARGEST = 2048  # largest side of a texture whose size is chosen here
@@ -42,9 +43,10 @@ def textured(mesh: Mesh, photos: Sequence[Photo], size: int) -> Texture:
     photos = [photo.sharper or photo for photo in photos]
     density = 0.0 if size else suitable_density(mesh, photos)
     atlas = unwrapped(mesh, LARGEST, density) if density else unwrapped(mesh, size or SMALLEST)
-    image, seen, exposures = _mean(mesh, photos, atlas)
-    with progress_bar("Texture fitted to photos", passing=True) as progress:
-        image = fitted(image, atlas, mesh, photos, exposures, progress)
+    with one_torch_thread():
+        image, seen, exposures = _mean(mesh, photos, atlas)
+        with progress_bar("Texture fitted to photos", passing=True) as progress:
+            image = fitted(image, atlas, mesh, photos, exposures, progress)
     return Texture(atlas, image, seen, exposures)
 
 

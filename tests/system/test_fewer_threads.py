@@ -1,4 +1,4 @@
-"""Threads on one processor."""
+"""Fewer threads of libraries."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import os
 import threading
 
 import pytest
+import torch
 
-from beags_plugin.system.one_processor import one_processor
+from beags_plugin.system.fewer_threads import one_processor, one_torch_thread
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="only Linux binds threads to processors here")
@@ -33,3 +34,15 @@ def test_errors_leave_no_thread_bound():
     with pytest.raises(ZeroDivisionError), one_processor():
         raise ZeroDivisionError
     assert os.sched_getaffinity(0) == former
+
+
+def test_torch_has_its_threads_again_after_an_error():
+    former = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        with pytest.raises(ZeroDivisionError), one_torch_thread():
+            assert torch.get_num_threads() == 1
+            raise ZeroDivisionError
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(former)

@@ -1,4 +1,4 @@
-"""Keep the threads of a library on one processor."""
+"""Limit the threads of libraries where more cost time and save none."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import ctypes
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+
+import torch
 
 
 @contextmanager
@@ -24,3 +26,14 @@ def one_processor() -> Iterator[None]:
         if former is not None:
             with suppress(OSError):  # Those processors may have been taken away meanwhile.
                 os.sched_setaffinity(0, former)
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Run torch's operations on one thread: waking others takes longer than many small operations do."""
+    former = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(former)
