@@ -30,7 +30,7 @@ AT_ONCE = {  # arguments: the beginning of the sentence
     f"export --load-config {RUN} --all --format step": "there is no exporter 'step'",
     "render --load-config {tmp}/notes.yml": "{tmp}/notes.yml is not a run of ns-train beags",
     f"render --load-config {RUN} --format sheets": "there is no format 'sheets' (did you mean sheet?)",
-    "eval --load-config {tmp}/run {tmp}/notes.yml": "{tmp}/notes.yml is not a run of ns-train beags",
+    "eval --load-config {tmp}/notes.yml": "{tmp}/notes.yml is not a run of ns-train beags",
     "doctor --data {tmp}/nowhere": "the data folder {tmp}/nowhere does not exist",
 }
 SCRIPT = """
