@@ -10,7 +10,6 @@ import numpy as np
 
 from beags_plugin.surfaces.fusion import Mesh
 from beags_plugin.surfaces.surface import corner_weights
-from beags_plugin.system.fewer_threads import one_processor
 from beags_plugin.system.open3d_kernels import open3d_kernels
 
 GAP = 2  # texels between charts, which are filled with the colours of the nearest texel in a chart
@@ -70,10 +69,9 @@ def unwrapped(mesh: Mesh, size: int, density: float = 0.0) -> Atlas:
     pack = xatlas.PackOptions()
     pack.padding, pack.bilinear, pack.create_image = GAP, True, False
     pack.resolution, pack.texels_per_unit = (0, density * mesh.voxel) if density else (size, 0.0)
-    with one_processor():  # xatlas shares out a connected mesh to one thread, for which another waits actively.
-        atlas = xatlas.Atlas()
-        atlas.add_mesh(places.astype(np.float32), mesh.faces.astype(np.uint32))
-        atlas.generate(xatlas.ChartOptions(), pack)
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(places.astype(np.float32), mesh.faces.astype(np.uint32))
+    atlas.generate(xatlas.ChartOptions(), pack)
     source, faces, uv = atlas[0]
     side = max(atlas.width, atlas.height, 1)  # xatlas may exceed the size slightly, or return 0 without area.
     if density:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from beags_plugin.surfaces.closing import Closed, closed
 from beags_plugin.surfaces.fusion import Mesh, decimated, fuse, suitable_resolution, without_small_parts
@@ -13,7 +14,6 @@ from beags_plugin.surfaces.item import ExportItem, NothingToExport
 from beags_plugin.surfaces.mesh_options import MeshOptions
 from beags_plugin.surfaces.surface import area_vectors
 from beags_plugin.surfaces.surface_alignment import placed
-from beags_plugin.system.fewer_threads import one_torch_thread
 from beags_plugin.system.open3d_kernels import open3d_kernels
 from beags_plugin.system.progress import progress_bar
 
@@ -46,7 +46,7 @@ def placed_surface(item: ExportItem, options: MeshOptions) -> tuple[Mesh, float]
     chosen = options.resolution, options.truncation, options.memory_mb, options.min_views, options.smallest_part
     aligned = item.shared.get(("placed", chosen))
     if aligned is None:
-        with progress_bar("Placing the surface", passing=True) as progress, one_torch_thread():
+        with progress_bar("Placing the surface", passing=True) as progress, threadpool_limits(1, "openmp"):
             aligned = item.shared["placed", chosen] = placed(mesh, item.photos, progress)
     return aligned
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 
 from beags_plugin.core.lifting import project
 from beags_plugin.surfaces.atlas import SMALLEST, Atlas, picture, texels, unwrapped
@@ -16,7 +17,6 @@ from beags_plugin.surfaces.fitting import fitted
 from beags_plugin.surfaces.fusion import Mesh
 from beags_plugin.surfaces.item import Photo
 from beags_plugin.surfaces.surface import area_vectors, vertex_normals
-from beags_plugin.system.fewer_threads import one_torch_thread
 from beags_plugin.system.progress import progress_bar
 
 LARGEST = 2048  # largest side of a texture whose size is chosen here
@@ -43,7 +43,7 @@ def textured(mesh: Mesh, photos: Sequence[Photo], size: int) -> Texture:
     photos = [photo.sharper or photo for photo in photos]
     density = 0.0 if size else suitable_density(mesh, photos)
     atlas = unwrapped(mesh, LARGEST, density) if density else unwrapped(mesh, size or SMALLEST)
-    with one_torch_thread():
+    with threadpool_limits(1, "openmp"):  # Waking other threads takes longer than torch's many small operations.
         image, seen, exposures = _mean(mesh, photos, atlas)
         with progress_bar("Texture fitted to photos", passing=True) as progress:
             image = fitted(image, atlas, mesh, photos, exposures, progress)

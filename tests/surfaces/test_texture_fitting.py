@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -145,6 +146,30 @@ def test_a_picture_of_more_pixels_than_can_be_fitted_stays_the_mean(box, photos,
     atlas, mean = mean_picture(box, photos)
     monkeypatch.setattr("beags_plugin.surfaces.fitting._MOST", 20_000)
     assert np.array_equal(fitted(mean, atlas, box, photos, np.ones((len(photos), 3))), mean)
+
+
+def test_threads_that_start_while_a_texture_is_made_keep_theirs(box, photos, monkeypatch):
+    """The viewer's for a new browser, say."""
+    counts = {}
+
+    def other():
+        counts["other"] = torch.get_num_threads()
+
+    def watched(*arguments):
+        counts["own"] = torch.get_num_threads()
+        thread = threading.Thread(target=other)
+        thread.start()
+        thread.join()
+        return fitted(*arguments)
+
+    former = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        monkeypatch.setattr("beags_plugin.surfaces.texture.fitted", watched)
+        textured(box, photos, 128)
+        assert counts == {"own": 1, "other": 2} and torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(former)
 
 
 def test_textures_come_from_the_sharper_photos(box, photos):
