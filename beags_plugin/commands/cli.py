@@ -257,8 +257,9 @@ def end_process() -> None:
     threading._shutdown()  # pyright: ignore[reportAttributeAccessIssue]  (as Python itself does first)
     atexit._run_exitfuncs()
     try:
-        sys.stdout.flush()
-        sys.stderr.flush()
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None and not stream.closed:  # None: the process was started without
+                stream.flush()
     except OSError:  # Python reports it as it ends.
         return
     os._exit(0)

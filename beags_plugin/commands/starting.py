@@ -52,8 +52,7 @@ def check_arguments(command: Any) -> None:
     """Raise ``UserError`` for a field of a command that names an unusable run, scene or choice."""
     values = vars(command)
     if load_config := values.get("load_config"):
-        single = isinstance(load_config, Path)
-        command.load_config = run_config(load_config) if single else tuple(map(run_config, load_config))
+        command.load_config = run_config(load_config)
     if (run := values.get("run_folder")) is not None:
         run_config(run)
     if (data := values.get("data")) is not None and not data.exists():

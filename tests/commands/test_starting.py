@@ -130,6 +130,13 @@ def test_a_process_with_torch_alone_ends_without_destructors(loaded, said):
     assert (done.stdout, done.stderr) == (said, "")
 
 
+@pytest.mark.parametrize("without", ["sys.stdout = None", "sys.stdout.close()"])
+def test_a_process_without_output_ends_in_success(without):
+    end = END.replace("cli.end_process()", f"{without}; cli.end_process()").replace('print, "at exit"', "int")
+    done = subprocess.run([sys.executable, "-c", end, "torch"], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 @pytest.mark.parametrize(("training", "policy"), [(False, "PASSIVE"), (True, None)])
 def test_threads_of_commands_that_do_not_train_wait_passively(monkeypatch, training, policy):
     monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
