@@ -1,13 +1,14 @@
 #!/usr/bin/env bash
 # Everything that needs a GPU:
 #   scripts/gpu_check.sh [--out FOLDER] [build] [tests] [memcheck] [racecheck] [synccheck] [benchmark]
-# Without names of stages it runs them all; where a command may only run for a few minutes, name one stage a
-# call (and build in each call, if the machine is a fresh one every time). It needs an NVIDIA GPU, nvcc, CMake, a C++
-# compiler, and a Python (PYTHON, default python3) with torch for CUDA, nanobind, numpy, scipy and pytest; no
-# nerfstudio. Where gsplat is installed, its kernels may take GSPLAT_SECONDS (150) to compile, else it is left out. The
-# benchmark begins nothing new after BENCHMARK_SECONDS (500). It builds in place, for the GPU that is here, and changes
-# nothing outside the repository. A stage that fails does not stop the others, except that nothing runs after a build
-# that failed; the exit code tells. Logs and cuda.json go to FOLDER (default build/gpu_check).
+# Without names of stages it runs them all; where a command may only run for a few minutes, name one stage a call
+# (and build in each call, if the machine is a fresh one every time). It needs an NVIDIA GPU, nvcc, CMake, a C++
+# compiler, and a Python (PYTHON, default python3) with torch for CUDA, nanobind, numpy, scipy, rich,
+# pytest and hypothesis; no nerfstudio. Where gsplat is installed, its kernels may take GSPLAT_SECONDS (150) to
+# compile, else it is left out. The benchmark begins nothing new after BENCHMARK_SECONDS (500). It builds in place,
+# for the GPU that is here, and changes nothing outside the repository. A stage that fails does not stop the
+# others, except that nothing runs after a build that failed; the exit code tells. Logs and cuda.json go to FOLDER
+# (default build/gpu_check).
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 python="${PYTHON:-python3}"
@@ -33,8 +34,8 @@ packages="$("$python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))
 for folder in /usr/local/cuda/bin "$packages"/nvidia/cu*/bin; do export PATH="$PATH:$folder"; done
 command -v nvcc >/dev/null || fail "there is no nvcc: install the CUDA toolkit, or pip install 'cuda-toolkit[nvcc]' nvidia-cuda-cccl"
 for tool in cmake c++; do command -v "$tool" >/dev/null || fail "there is no $tool: install it"; done
-for package in torch nanobind numpy scipy pytest; do
-  "$python" -c "import $package" 2>/dev/null || fail "$python has no $package: pip install $package"
+for package in torch nanobind numpy scipy rich pytest hypothesis; do
+  "$python" -c "import $package" 2>/dev/null || fail "$python has no $package: install it with pip"
 done
 "$python" -c 'import torch, sys; sys.exit(not torch.cuda.is_available())' || fail "$python has no torch that sees the GPU"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -11,7 +12,9 @@ from torch import Tensor
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import SH_C0, num_sh_bases
 from beags_plugin.core.surfels import Surfels, opacities
-from beags_plugin.options.scene_options import DensifyConfig
+
+if TYPE_CHECKING:
+    from beags_plugin.options.stages import DensifyConfig
 
 # These values are those of the official code of 2DGS (Huang et al., SIGGRAPH 2024); scales are relative to the extent.
 GRADIENT_THRESHOLD = 2e-4  # mean screen gradient from which a surfel is cloned or split

@@ -7,12 +7,12 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, get_args
 
 from beags_plugin.core.schedule import PhaseSchedule
-from beags_plugin.options.loss_spec import LossSpec, Phase
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.registry import Registry
 
 if TYPE_CHECKING:
     from beags_plugin.losses.base import Loss
+    from beags_plugin.options.loss_spec import LossSpec
 
 LOSSES = Registry(
     "loss",
@@ -30,6 +30,8 @@ LOSSES = Registry(
 
 def make_loss(name: str, spec: LossSpec, schedule: PhaseSchedule) -> Loss:
     """Return the loss called ``name``, with absolute steps; raises ``UserError`` for a wrong value."""
+    from beags_plugin.options.loss_spec import Phase
+
     kind = LOSSES.get(name)
     if not 0.0 <= spec.weight < math.inf:
         raise UserError(f"the loss {name} has the weight {spec.weight}: give 0 (off) or more.")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -15,11 +16,13 @@ from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks import REPROJECTIONS
-from beags_plugin.options.scene_options import PreparationConfig
 from beags_plugin.preparation.refiner import Progress
 from beags_plugin.rasterizers.interface import Rasterizer, RasterSettings
 from beags_plugin.rasterizers.rendering import geometry_inputs, surface_depth
 from beags_plugin.system.progress import each_view
+
+if TYPE_CHECKING:
+    from beags_plugin.options.stages import PreparationConfig
 
 AUTO = "auto"  # It stands for pairwise up to the two limits, else for voxel.
 PAIRWISE_PIXELS = 100_000_000  # Pixels of all views; pairwise holds 5 bytes for each, 0.5 GB.

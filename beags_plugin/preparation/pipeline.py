@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -20,7 +21,6 @@ from beags_plugin.labels.class_ranks import ClassRanks
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.options.scene_options import PreparationConfig
 from beags_plugin.preparation.agreed import AgreementReport, agree
 from beags_plugin.preparation.consistent_masks import (
     AUTO,
@@ -38,6 +38,9 @@ from beags_plugin.rasterizers.rendering import SURFACE_DEPTHS
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.filed_tensors import filed
 from beags_plugin.system.progress import timed
+
+if TYPE_CHECKING:
+    from beags_plugin.options.stages import PreparationConfig
 
 LEAST_K = 10  # Fewer neighbours would measure the noise of the depth rather than the distance of points.
 

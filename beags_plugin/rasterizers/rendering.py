@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -11,9 +12,11 @@ from beags_plugin.core.cameras import Camera
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ranks import ClassRanks
-from beags_plugin.options.scene_options import SceneOptions
 from beags_plugin.rasterizers.interface import Rasterizer, RasterOutputs, RasterSettings, SurfelInputs, map_ids
 from beags_plugin.system.errors import check_choice
+
+if TYPE_CHECKING:
+    from beags_plugin.options.scene_options import SceneOptions
 
 SURFACE_DEPTHS = ("median", "expected")
 """The depths of E4 that can stand for the surface where pixels are lifted into space."""

@@ -22,7 +22,8 @@ from typing import Any, TypeVar
 import yaml
 
 from beags_plugin.options.run_format import RUN_FORMAT
-from beags_plugin.options.scene_options import DensifyConfig, PreparationConfig, SceneOptions
+from beags_plugin.options.scene_options import SceneOptions
+from beags_plugin.options.stages import DensifyConfig, PreparationConfig
 from beags_plugin.system.errors import UserError
 from beags_plugin.system.reading.text import reason
 from beags_plugin.views.data_options import DataOptions, RunViewOptions

@@ -24,7 +24,7 @@ from beags_plugin.core.densification import (
 from beags_plugin.core.rotations import rotation_from_quat
 from beags_plugin.core.sh import sh_colors
 from beags_plugin.core.surfels import Surfels
-from beags_plugin.options.scene_options import DensifyConfig
+from beags_plugin.options.stages import DensifyConfig
 
 EXTENT = 2.0
 CONFIG = DensifyConfig()

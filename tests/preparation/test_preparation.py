@@ -15,7 +15,7 @@ from beags_plugin.core.lifting import TAU
 from beags_plugin.core.surfels import Surfels
 from beags_plugin.labels.class_ids import IGNORE
 from beags_plugin.labels.label_maps import LabelMaps
-from beags_plugin.options.scene_options import PreparationConfig
+from beags_plugin.options.stages import PreparationConfig
 from beags_plugin.preparation import consistent_masks
 from beags_plugin.preparation.agreed import AgreementReport
 from beags_plugin.preparation.consistent_masks import chosen_reprojection

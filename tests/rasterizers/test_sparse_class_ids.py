@@ -15,7 +15,7 @@ from beags_plugin.losses.base import LossInputs
 from beags_plugin.losses.occupancy import OccupancyLoss
 from beags_plugin.masks import reprojection
 from beags_plugin.occupancy.grid import VisibilityGrid
-from beags_plugin.options.scene_options import PreparationConfig
+from beags_plugin.options.stages import PreparationConfig
 from beags_plugin.preparation.pipeline import Preparation, prepare
 from beags_plugin.rasterizers.interface import RasterSettings
 from beags_plugin.rasterizers.rendering import render_class_map

@@ -15,7 +15,7 @@ from raster_scenes import CLASSES
 from beags_plugin.labels.label_maps import CompressedMaps, LabelMaps
 from beags_plugin.masks import REPROJECTIONS
 from beags_plugin.masks.voxel_reprojection import reproject_voxel
-from beags_plugin.options.scene_options import PreparationConfig
+from beags_plugin.options.stages import PreparationConfig
 from beags_plugin.preparation import consistent_masks
 from beags_plugin.preparation.pipeline import prepare
 from beags_plugin.refiners import make_refiner

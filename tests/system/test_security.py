@@ -90,8 +90,8 @@ def test_configs_of_runs_are_read_as_nerfstudio_reads_them(config):
 @pytest.mark.parametrize(
     ("now", "former"),
     [
-        ("options.scene_options.DensifyConfig", "core.densification.DensifyConfig"),
-        ("options.scene_options.PreparationConfig", "preparation.pipeline.PreparationConfig"),
+        ("options.stages.DensifyConfig", "core.densification.DensifyConfig"),
+        ("options.stages.PreparationConfig", "preparation.pipeline.PreparationConfig"),
     ],
 )
 def test_classes_that_have_moved_since_are_found_under_their_former_names(config, tmp_path, now, former):

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import re
 import shutil
 import subprocess
+import sys
 import time
 
 import pytest
@@ -49,3 +52,27 @@ def test_the_check_reports_a_missing_gpu(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, env={"PATH": "/usr/bin:/bin"}, timeout=60)
     assert done.returncode == 1
     assert (done.stdout + done.stderr).strip() == "gpu_check: there is no NVIDIA GPU, or no driver for it"
+
+
+ABSENT = """
+import sys
+import pytest
+for name in sys.argv[1].split(","):
+    sys.modules[name] = None
+sys.exit(pytest.main(["--collect-only", "-q", *sys.argv[2:]]) or __import__("beags_benchmarks.kernels.cuda") is None)
+"""
+
+
+def test_the_check_needs_no_package_that_it_does_not_name():
+    script = SCRIPT.read_text()
+    needed = re.search(r"for package in (.+); do", script)
+    files = re.findall(r"tests/\w+/test_(?:\{[\w,]+\}|\w+)\.py", script)
+    assert needed is not None and len(files) == 4
+    named = subprocess.run(["bash", "-c", f"echo {' '.join(files)}"], capture_output=True, text=True, check=True)
+    absent = {"nerfstudio", "tyro", "cv2", "open3d", "tensorboard", "torchvision", "xatlas", "skimage", "trimesh"}
+    absent |= {"PIL", "zstandard", "psutil", "matplotlib", "pycocotools", "pycolmap", "onnxruntime", "sklearn", "viser"}
+    assert not absent & set(needed[1].split())
+    command = [sys.executable, "-c", ABSENT, ",".join(sorted(absent)), *named.stdout.split()]
+    env = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=env)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]

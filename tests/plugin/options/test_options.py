@@ -10,7 +10,7 @@ import pytest
 from beags_plugin.losses.occupancy import OccupancyLoss
 from beags_plugin.losses.photometric import PhotometricLoss
 from beags_plugin.masks import REPROJECTIONS
-from beags_plugin.options.scene_options import PreparationConfig
+from beags_plugin.options.stages import PreparationConfig
 from beags_plugin.preparation.pipeline import check_options
 from beags_plugin.system.errors import UserError
 

@@ -13,7 +13,7 @@ from beags_plugin.core.densification import grows_at, resets_at, scaled
 from beags_plugin.core.schedule import PhaseSchedule, log_linear
 from beags_plugin.losses import make_loss
 from beags_plugin.options.loss_spec import LossSpec
-from beags_plugin.options.scene_options import DensifyConfig
+from beags_plugin.options.stages import DensifyConfig
 from beags_plugin.plugin.training.callbacks import camera_extent
 from beags_plugin.plugin.training.scene_edits import move_adam_state
 

@@ -14,7 +14,7 @@ from random_surfels import random_surfels
 from beags_plugin.core.cameras import Camera
 from beags_plugin.core.densification import densify
 from beags_plugin.labels.class_ids import IGNORE
-from beags_plugin.options.scene_options import DensifyConfig
+from beags_plugin.options.stages import DensifyConfig
 from beags_plugin.plugin.training.near_growth import MORE, PHOTOS, MaskedPhotos, on_objects, shared_pixels
 from beags_plugin.views.views import View
 

@@ -80,7 +80,7 @@ def _config_files() -> list[bytes]:
     from beags_plugin.plugin.options.config import base_config
 
     text = yaml.dump(base_config())
-    short = "!!python/object:beags_plugin.options.scene_options.DensifyConfig\nevery: 100\nstart: 500\n"
+    short = "!!python/object:beags_plugin.options.stages.DensifyConfig\nevery: 100\nstart: 500\n"
     return [text.encode(), short.encode(), b"a: !!python/object/apply:pathlib.PosixPath [a, b]\n"]
 
 
