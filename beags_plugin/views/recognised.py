@@ -14,7 +14,11 @@ from beags_plugin.views.poses import PosedViews
 
 def recognised(parser: Any, scene: Dataset, views: PosedViews, metadata: Mapping[str, Any]) -> list[str]:
     """Return a line on how the data was read, and notes for the user."""
-    notes = []
+    stems = set().union(*views.stems)
+    absent = [name for name in scene.split.held_out if name not in stems]
+    notes = [
+        f"The layout holds out {name}, but no image has that name: name the view with --held-out." for name in absent
+    ]
     truth = metadata["ground_truth"] or {"visible": {}, "silhouettes": {}}
     if unknown := sorted({*truth["visible"], *truth["silhouettes"]} - set(metadata["classes"].values())):
         notes.append(

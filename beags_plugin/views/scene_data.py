@@ -36,9 +36,9 @@ class SplitData:
 
     metadata: ``points3D_xyz`` [P, 3] float32 in the world of the cameras, ``points3D_rgb`` [P, 3] uint8,
     ``points3D_random`` (whether the points are sampled), ``classes`` (id to name), ``mask_filenames`` (a path or None
-    for each view), ``no_truth`` (the file ``labels.classes.NO_TRUTH``, or
-    None), ``ignore_ids``, ``ground_truth`` (``data.ground_truth.GroundTruth`` or None), ``stray_truth`` (a sentence on
-    exact masks of no view, or None).
+    for each view), ``no_truth`` (the file ``labels.classes.NO_TRUTH``, or None),
+    ``ignore_ids``, ``ground_truth`` (``data.ground_truth.GroundTruth`` or None), ``stray_truth`` (a sentence on exact
+    masks of no view, or None).
     """
 
     images: list[Path]

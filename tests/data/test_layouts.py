@@ -22,7 +22,7 @@ from parsed_views import AS_GIVEN, POINT, moved, names, parse, pixel, real, titl
 
 import beags_plugin.data.files as files
 from beags_plugin.data import LAYOUTS
-from beags_plugin.data.dataset import Dataset, PoseTable
+from beags_plugin.data.dataset import Dataset, PoseTable, Split
 from beags_plugin.data.layout import Layout
 from beags_plugin.plugin.views.dataset import BeagsDataset
 from beags_plugin.system.errors import UserError
@@ -131,7 +131,8 @@ class Turntable(Layout):
         shots = tuple(root / f"shot{index}.png" for index in range(9))
         sizes = np.full((9, 2), (WIDTH, HEIGHT))
         table = PoseTable(root / "turntable.txt", shots, poses[:, :3], np.stack([K] * 9), sizes)
-        return Dataset(self.title, root, table)
+        held_out = (root / "turntable.txt").read_text().split()
+        return Dataset(self.title, root, table, Split(held_out=tuple(held_out)) if held_out else Split())
 
 
 def test_another_package_can_add_a_layout(tmp_path, monkeypatch):
@@ -144,6 +145,16 @@ def test_another_package_can_add_a_layout(tmp_path, monkeypatch):
     outputs = parse(tmp_path)
     assert names(outputs) == [f"shot{index}" for index in range(1, 8)]
     assert outputs.metadata["classes"] == {0: "background", 6: "class_6"} and outputs.metadata["points3D_random"]
+
+
+def test_a_view_that_a_layout_holds_out_in_vain_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(LAYOUTS._specs, "turntable", "test_layouts:Turntable")
+    (tmp_path / "turntable.txt").write_text("shot2 front")
+    for index in range(9):
+        write_image(tmp_path / f"shot{index}.png", noise(index))
+    parse(tmp_path)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "holds out front, but no image has that name" in said and "holds out shot2" not in said
 
 
 COLMAP_K = [[FX, 0, CX], [0, FY, CY], [0, 0, 1]]
