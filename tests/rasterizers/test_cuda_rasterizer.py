@@ -64,7 +64,7 @@ class Guarded:
 
 
 def test_the_backward_of_a_render_larger_than_its_memory_stays_in_its_memory(emulated, monkeypatch):
-    """Such a render has no gradients; it occurs in a CUDA graph, where nothing is rendered again."""
+    """Such a render has no gradients; here the host does not draw it again, as it otherwise does."""
     monkeypatch.setattr("beags_plugin.rasterizers.pair_counts._STEP", 16)
     small, large = make_scene(count=2, size=-5.0), make_scene(count=200)
     small.draw(emulated)

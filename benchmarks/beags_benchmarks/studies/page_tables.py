@@ -231,7 +231,7 @@ _METRICS = (
 )
 _ROW = ("scene", "seed", "variant", "failed", "failures", "error_left", "lost_biou", "shown_after", "ssim_after",
         "rendered_iou_after", "rendered_biou_after", "rendered_covered_after", "extracted_spill_before",
-        "extracted_spill_after", "psnr_fit_before", "psnr_fit_after", 
+        "extracted_spill_after", "psnr_fit_before", "psnr_fit_after",
         "close_up_biou_after", "close_up_psnr_after", "close_up_ssim_after", "steps", "cpu_seconds",
         "cpu_seconds total", "own_memory_mb", "peak_memory_mb", "objects")  # fmt: skip
 _OF_OBJECTS = "extracted_biou_after"

@@ -34,7 +34,7 @@ BEAGS_DEVICE T warp_sum_4(T n0, T n1, T n2, T n3, int lane) {
   return sum;
 }
 
-// A render with more pairs than memory has no gradients. It only happens where the host does not wait, in a CUDA graph.
+// A render with more pairs than memory has no gradients; the host draws it again before it asks for any.
 template <class T>
 BEAGS_DEVICE bool fits(const Bins<T>& bins) {
   return bins.totals[0] <= bins.capacity;
@@ -217,7 +217,7 @@ __global__ void sum_records_kernel(int64_t count, Bins<T> bins, const T* records
   const int64_t r = (static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x) / kWarpThreads;
   if (r >= count) return;
   const int lane = threadIdx.x % kWarpThreads, number = lane % kSize, which = lane / kSize;
-  // In a CUDA graph, a replay may have more pairs than memory.
+  // Pairs beyond the memory have no records.
   const int64_t stop = bins.pair_start[r + 1] < bins.capacity ? bins.pair_start[r + 1] : bins.capacity;
   double sum = 0;
   if (which < kTogether) {
