@@ -99,7 +99,7 @@ def test_a_run_written_without_nerfstudio_is_read_with_it(config, tmp_path):
     [
         ("!!python/name:beags_plugin.plugin.trainer.BeagsTrainer ''", "!!python/name:os.system ''", "names os.system"),
         ("!!python/object:nerfstudio.configs.base_config.MachineConfig", "!!python/object:os.Machine", "names os.Mach"),
-        (".options.scene_options.Den", ".options.gone.Den", "older"),
+        (".options.stages.Den", ".options.gone.Den", "older"),
         ("run_format: 3", "run_format: 2", "older version"),
     ],
 )
