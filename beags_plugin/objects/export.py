@@ -83,6 +83,8 @@ def export_run(
     exporters = dict(sorted(exporters.items(), key=lambda named: (named[1].needs_photos, named[1].needs_views)))
     if not exporters:
         raise UserError("no format is named: name one with --format.")
+    for name, exporter in exporters.items():
+        _check_size(name, exporter, pose, 'with --scale-by, such as "frame_0012:340,215 frame_0012:512,220 12 cm".')
     scene = run.assigned if everything or objects or not whole else run.scene
     present = objects_with_gaussians(scene, objects, run.folder) if scene.assigned else {}
     if everything and objects:
@@ -91,8 +93,6 @@ def export_run(
         raise UserError(
             f"nothing to export is named: use --all, --whole, or --object with one of {', '.join(present)}."
         )
-    for name, exporter in exporters.items():
-        _check_size(name, exporter, pose, 'with --scale-by, such as "frame_0012:340,215 frame_0012:512,220 12 cm".')
     transform, frame, views = run.transform, run.frame, None
     if closing is not None and (reason := open3d_missing()):
         raise UserError(f"objects cannot be closed here: {reason}")
