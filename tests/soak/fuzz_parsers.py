@@ -33,9 +33,9 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).resolve().parent)]
 
 NAMES = (
-    "ply", "seed points", "npy poses", "npz cameras", "npz member", "colmap images", "colmap cameras", "colmap points",
-    "transforms.json", "classes.json", "coco", "prompts", "experiment", "run config", "checkpoint", "checkpoint pickle",
-    "voxel grid", "mask", "mask rows",
+    "ply", "seed points", "npy poses", "colmap images", "colmap cameras", "colmap points", "transforms.json",
+    "classes.json", "coco", "prompts", "experiment", "run config", "checkpoint", "checkpoint pickle", "voxel grid",
+    "mask", "mask rows",
 )  # fmt: skip
 SECONDS = 20  # seconds of CPU time for one file
 STUCK = 600  # seconds of wall time after which atheris takes a parser to be stuck
