@@ -71,15 +71,16 @@ def show_text(handle: Any, text: str) -> None:
 def set_pace(viewer: Viewer, client_id: int, pace: Pace, windows: Windows | None) -> None:
     """Let ``pace`` choose the size of a page's pictures while its camera moves, and ``windows`` the size at rest.
 
-    windows: if None, nerfstudio chooses the size at rest.
+    windows: no picture is larger than its size at rest; if None, nerfstudio chooses the size at rest.
     """
     machine, controls = viewer.render_statemachines[client_id], viewer.control_panel
     still = machine._calculate_image_res
 
     def size(aspect_ratio: float) -> tuple[int, int]:
+        rest = None if windows is None else windows.size(client_id, aspect_ratio)
         if machine.state != "high":
-            return pace.size(aspect_ratio, controls.max_res)
-        return still(aspect_ratio) if windows is None else windows.size(client_id, aspect_ratio)
+            return pace.size(aspect_ratio, controls.max_res if rest is None else max(rest))
+        return rest or still(aspect_ratio)
 
     machine._calculate_image_res = size  # type: ignore[method-assign]
 

@@ -1,6 +1,8 @@
 """Set up the page of a finished run: no controls of training, and pictures at rest as large as the canvas.
 
-Viser's camera messages do not contain the size of the canvas, so a script in the page sends it.
+Viser's camera messages do not contain the size of the canvas, so a script in the page sends it. Viser ignores what a
+page sends before its first camera, and a text that another page has sent already; so the script comes with the first
+camera, and its text begins with the page's number.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from viser import _messages
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
-    from viser import GuiEvent, ViserServer
+    from viser import ClientHandle, GuiEvent, ViserServer
 
 _LABEL = "Canvas of this page"
 _FIRST = 512  # Pixels of the longer side until the page has sent its own; nerfstudio's default.
@@ -29,7 +31,7 @@ _TELL = """
     if (!row || !canvas) return;
     const input = row.querySelector("input");
     if (row.parentElement) row.parentElement.style.display = "none";
-    const size = canvas.clientWidth + "x" + canvas.clientHeight;
+    const size = PAGE + " " + canvas.clientWidth + "x" + canvas.clientHeight;
     if (size == told) return;
     told = size;
     Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(input, size);
@@ -49,13 +51,18 @@ class Windows:
         server: ViserServer = viewer.viser_server
         field = server.gui.add_text(_LABEL, "")
         field.on_update(self._resized)
-        script = _TELL.replace("LABEL", json.dumps(_LABEL))
-        server.gui._websock_interface.queue_message(_messages.RunJavascriptMessage(script))
+        server.on_client_connect(self._joined)
+        server.on_client_disconnect(lambda client: self._sizes.pop(client.client_id, None))
         viewer.control_panel._max_res.value = _LARGEST  # It now only bounds the canvas's size.
+
+    @staticmethod
+    def _joined(client: ClientHandle) -> None:
+        script = _TELL.replace("LABEL", json.dumps(_LABEL)).replace("PAGE", str(client.client_id))
+        client.gui._websock_interface.queue_message(_messages.RunJavascriptMessage(script))
 
     def _resized(self, event: GuiEvent) -> None:
         try:
-            width, height = (int(word) for word in str(event.target.value).split("x"))
+            width, height = (int(word) for word in str(event.target.value).partition(" ")[2].split("x"))
         except ValueError:
             return
         if event.client_id is not None and min(width, height) > 0:

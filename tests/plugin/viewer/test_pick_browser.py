@@ -72,6 +72,7 @@ def test_the_first_moment_shows_the_scene_and_a_click_on_a_camera_is_told(served
         for word in ("Training", "Train Util", "Train Speed", "NerfStudio"):
             assert word not in text
         page.wait(lambda: "Canvas of this page" not in page.text())
+        awaited(page, lambda now: varied(now) > 2)  # Viser ignores what a page sends before its first camera.
         assert page.evaluate("document.querySelectorAll('img[src^=http]').length") == 0
         page.press("Show Train Cams")
         page.wait_for_text("Hide Train Cams")
