@@ -52,13 +52,16 @@ class Windows:
         field = server.gui.add_text(_LABEL, "")
         field.on_update(self._resized)
         server.on_client_connect(self._joined)
-        server.on_client_disconnect(lambda client: self._sizes.pop(client.client_id, None))
+        server.on_client_disconnect(self._left)
         viewer.control_panel._max_res.value = _LARGEST  # It now only bounds the canvas's size.
 
     @staticmethod
     def _joined(client: ClientHandle) -> None:
         script = _TELL.replace("LABEL", json.dumps(_LABEL)).replace("PAGE", str(client.client_id))
         client.gui._websock_interface.queue_message(_messages.RunJavascriptMessage(script))
+
+    def _left(self, client: ClientHandle) -> None:
+        self._sizes.pop(client.client_id, None)
 
     def _resized(self, event: GuiEvent) -> None:
         try:
