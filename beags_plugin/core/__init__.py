@@ -1,1 +1,1 @@
-"""Maths of cameras, surfels and scenes: torch and numpy only, no nerfstudio."""
+"""Maths of cameras, Gaussians and scenes: torch and numpy only, no nerfstudio."""

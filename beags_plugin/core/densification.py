@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from beags_plugin.options.stages import DensifyConfig
 
 # These values are those of the official code of 2DGS (Huang et al., SIGGRAPH 2024); scales are relative to the extent.
-GRADIENT_THRESHOLD = 2e-4  # mean screen gradient from which a surfel is cloned or split
-CLONE_SCALE = 0.01  # a larger surfel is split, a smaller one cloned
-SPLIT_SHRINK = 1.6  # both halves of a split surfel are this much smaller
-PRUNE_OPACITY = 0.05  # fainter surfels are pruned
-PRUNE_SCALE = 0.1  # larger surfels are pruned
+GRADIENT_THRESHOLD = 2e-4  # mean screen gradient from which a Gaussian is cloned or split
+CLONE_SCALE = 0.01  # a larger Gaussian is split, a smaller one cloned
+SPLIT_SHRINK = 1.6  # both halves of a split Gaussian are this much smaller
+PRUNE_OPACITY = 0.05  # fainter Gaussians are pruned
+PRUNE_SCALE = 0.1  # larger Gaussians are pruned
 RESET_OPACITY = 0.01
 INITIAL_OPACITY = 0.1
 # Ours, for runs that are shorter than the official ones: ``scaled`` makes no interval shorter than these.
@@ -71,7 +71,7 @@ def resets_at(config: DensifyConfig, done: int) -> bool:
 
 @dataclass(frozen=True)
 class Densified:
-    """The edited scene: M surfels, the index [M] that each came from, and whether it is new, fresh [M] bool."""
+    """The edited scene: M Gaussians, the index [M] that each came from, and whether it is new, fresh [M] bool."""
 
     surfels: Surfels
     source: Tensor
@@ -88,14 +88,14 @@ class Densified:
         return Densified(edited.surfels, self.source[edited.source], self.fresh[edited.source] | edited.fresh)
 
     def only(self, keep: Tensor) -> Densified:
-        """Return this edit with the surfels of ``keep`` [M] bool alone; at least the most opaque one remains."""
+        """Return this edit with the Gaussians of ``keep`` [M] bool alone; at least the most opaque one remains."""
         if not bool(keep.any()):
             keep = keep.index_fill(0, self.surfels.opacity_logits.argmax(), True)
         return Densified(self.surfels[keep], self.source[keep], self.fresh[keep])
 
 
 class GradientStatistics:
-    """Mean screen gradient of N surfels over the views that saw them."""
+    """Mean screen gradient of N Gaussians over the views that saw them."""
 
     def __init__(self, count: int, device: torch.device | str = "cpu") -> None:
         self.total = torch.zeros(count, device=device)
@@ -108,12 +108,12 @@ class GradientStatistics:
         self.views += seen.to(self.views)
 
     def mean(self) -> Tensor:
-        """Return [N]; 0 for a surfel that no view saw."""
+        """Return [N]; 0 for a Gaussian that no view saw."""
         return self.total / self.views.clamp_min(1.0)
 
 
 def length_units(means: Tensor, camera_centers: Tensor, extent: float, config: DensifyConfig) -> Tensor:
-    """Return the lengths [N], world units, that ``CLONE_SCALE`` and ``PRUNE_SCALE`` multiply for surfels at ``means``.
+    """Return the lengths [N], world units, that ``CLONE_SCALE`` and ``PRUNE_SCALE`` multiply at ``means``.
 
     They are the scene's extent, or with ``far_limits`` the distance of the nearest camera if larger. means: [N, 3].
     camera_centers: [V, 3].
@@ -134,9 +134,9 @@ def densify(
 ) -> Densified:  # fmt: skip
     """Clone, split and prune surfels.
 
-    surfels: N surfels without gradients. mean_gradient: [N]. units: [N] of ``length_units``. step: the current step,
-    for ``prune_scale_after``. apart: [N] bool, surfels with a bound of their own, and that bound (0: none); the
-    config's bounds the others. At least one surfel always remains.
+    surfels: N Gaussians without gradients. mean_gradient: [N]. units: [N] of ``length_units``. step: the current step,
+    for ``prune_scale_after``. apart: [N] bool, Gaussians with a bound of their own, and that bound (0: none); the
+    config's bounds the others. At least one Gaussian always remains.
     """
     size = surfels.log_scales.exp().amax(dim=-1)
     chosen = mean_gradient >= GRADIENT_THRESHOLD
@@ -157,9 +157,9 @@ def densify(
 
 
 def split_by_sampling(surfels: Surfels, chosen: Tensor, generator: torch.Generator) -> Densified:
-    """Replace each chosen surfel by two copies, placed by its own Gaussian and smaller by ``SPLIT_SHRINK``.
+    """Replace each chosen Gaussian by two copies, placed by its own density and smaller by ``SPLIT_SHRINK``.
 
-    surfels: N surfels without gradients. chosen: [N] bool. The others keep their order; the copies follow them. This
+    surfels: N Gaussians without gradients. chosen: [N] bool. The others keep their order; the copies follow them. This
     is the split of densification.
     """
     return _grow(surfels, torch.zeros_like(chosen), chosen, generator)
@@ -179,7 +179,7 @@ def _grow(surfels: Surfels, cloned: Tensor, split: Tensor, generator: torch.Gene
 
 
 def _within_budget(chosen: Tensor, gradient: Tensor, max_surfels: int, count: int) -> Tensor:
-    """Restrict the chosen to those of largest gradient that fit beside ``count`` surfels (``max_surfels`` 0: all)."""
+    """Restrict the chosen to those of largest gradient that fit beside ``count`` Gaussians (``max_surfels`` 0: all)."""
     room = max(max_surfels - count, 0)
     if max_surfels <= 0 or int(chosen.sum()) <= room:
         return chosen
@@ -190,7 +190,7 @@ def _within_budget(chosen: Tensor, gradient: Tensor, max_surfels: int, count: in
 
 
 def _offsets(surfels: Surfels, generator: torch.Generator) -> Tensor:
-    """Sample each surfel's own Gaussian in its plane, [M, 3]."""
+    """Sample a point of each Gaussian in its plane, [M, 3]."""
     normal = torch.randn(len(surfels), 2, generator=generator).to(surfels.means)
     local = normal * surfels.log_scales.exp()
     axes = rotation_from_quat(surfels.quats)[:, :, :2]
@@ -204,9 +204,9 @@ def reset_opacity(surfels: Surfels) -> Tensor:
 
 
 def initial_surfels(points: Tensor, colors: Tensor, sh_degree: int, generator: torch.Generator) -> Surfels:
-    """Make one surfel per seed point: sized by the distance of its neighbours, faint and randomly rotated.
+    """Make one Gaussian per seed point: sized by the distance of its neighbours, faint and randomly rotated.
 
-    points: [N, 3] world. colors: [N, 3] in 0..1. Returns N surfels in float32 without gradients.
+    points: [N, 3] world. colors: [N, 3] in 0..1. Returns N Gaussians in float32 without gradients.
     """
     from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
 

@@ -20,7 +20,7 @@ _AXES_TO = ((0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1.0, 0.0, 0.0, 0.0))
 class Gaussians:
     """N Gaussians as files hold them, flat or not; float32, otherwise as in ``core.surfels.Surfels``.
 
-    means: [N, 3]. quats: [N, 4] wxyz. log_scales: [N, 2] of surfels, normal along the third axis; or [N, 3].
+    means: [N, 3]. quats: [N, 4] wxyz. log_scales: [N, 2] of flat Gaussians, normal along the third axis; or [N, 3].
     opacity_logits: [N]. sh_dc: [N, 3]. sh_rest: [N, K, 3].
     """
 
@@ -61,10 +61,10 @@ class Flattening:
 
 
 def flatten(gaussians: Gaussians) -> tuple[Surfels, Flattening | None]:
-    """Return surfels in the plane of each Gaussian's two larger axes, with its opacity and colour.
+    """Return flat Gaussians in the plane of each Gaussian's two larger axes, with its opacity and colour.
 
-    Those whose thinnest axis is the third keep their quaternion. Returns N surfels, and how thick the Gaussians were
-    (None if they are surfels already, or if N is 0). Infinite opacity logits become 30, which is opaque.
+    Those whose thinnest axis is the third keep their quaternion. Returns N flat Gaussians, and how thick they were
+    (None if they are flat already, or if N is 0). Infinite opacity logits become 30, which is opaque.
     """
     logits = gaussians.opacity_logits.nan_to_num(posinf=30.0, neginf=-30.0)
     quats, scales, thickness = gaussians.quats, gaussians.log_scales, None

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 LONGEST_QUAT = 1e12
-"""Quaternions longer than this, or shorter than its reciprocal, count as broken wherever surfels are used.
+"""Quaternions longer than this, or shorter than its reciprocal, count as broken wherever Gaussians are used.
 
 The gradient of a quaternion is that of its rotation divided by its length, which would overflow in float32.
 """

@@ -59,7 +59,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def sh_colors(sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_center: Tensor, degree: int) -> Tensor:
-    """Return the colour of each surfel as seen from ``camera_center``: SH + 0.5, clamped at 0.
+    """Return the colour of each Gaussian as seen from ``camera_center``: SH + 0.5, clamped at 0.
 
     sh_dc: [N, 3], degree 0. sh_rest: [N, K, 3], the others, K >= (degree + 1)^2 - 1. means: [N, 3] world.
     camera_center: [3] world, on any device. Returns [N, 3]. Computed by the compiled op where it can be.
@@ -69,7 +69,7 @@ def sh_colors(sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_center: Tens
         return compiled.sh_colors(sh_dc, sh_rest, means, camera_center, degree)
     if degree == 0:
         return (SH_C0 * sh_dc + 0.5).clamp_min(0.0)
-    # A surfel at the camera has direction 0: normalize divides by 1e-12 at least.
+    # A Gaussian at the camera has direction 0: normalize divides by 1e-12 at least.
     directions = torch.nn.functional.normalize(means - camera_center.to(means), dim=-1)
     basis = sh_basis(directions, degree)
     sh = torch.cat([sh_dc[:, None], sh_rest[:, : basis.shape[1] - 1]], dim=1)

@@ -27,7 +27,7 @@ def occupancy_loss(
     Its memory does not grow with ``samples``.
 
     means [N, 3], quats [N, 4] wxyz, log_scales [N, 2], opacity_logits [N]: as in ``core.surfels.Surfels``; float32 or
-        float64, on the CPU or a GPU. Surfels with a parameter that is not finite, or with a scale of 0, count as 0.
+        float64, on the CPU or a GPU. Gaussians with a parameter that is not finite, or with a scale of 0, count as 0.
     class_ids: [N] int32, phi.
     lookup: that of the visibility grid.
     stream: 64 bits that decide the random points, from ``occupancy.sampling.sample_stream``.

@@ -10,7 +10,7 @@ from beags_plugin.ops import cuda_extension, extension
 
 
 def sh_colors(sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_center: Tensor, degree: int) -> Tensor:
-    """Return the colour of each surfel as seen from ``camera_center``: SH + 0.5, clamped at 0; [N, 3].
+    """Return the colour of each Gaussian as seen from ``camera_center``: SH + 0.5, clamped at 0; [N, 3].
 
     sh_dc: [N, 3], degree 0. sh_rest: [N, K, 3], the others, K >= (degree + 1)^2 - 1. means: [N, 3] world.
     camera_center: [3] world, without gradient, read faster from the CPU. degree: 0..3. All float32 or all float64, on

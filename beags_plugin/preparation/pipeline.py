@@ -38,6 +38,7 @@ from beags_plugin.rasterizers.rendering import SURFACE_DEPTHS
 from beags_plugin.system.errors import UserError, check_choice
 from beags_plugin.system.filed_tensors import filed
 from beags_plugin.system.progress import timed
+from beags_plugin.system.wording import amount
 
 if TYPE_CHECKING:
     from beags_plugin.options.stages import PreparationConfig
@@ -221,7 +222,7 @@ def _reprojection_summary(before: Sequence[Tensor | None], after: Sequence[Tenso
             changed, pixels = changed + int((old != new).sum()), pixels + old.numel()
     return (
         f"reprojection: {changed} of {pixels} labelled pixels changed ({100 * changed / max(pixels, 1):.2f} %), "
-        f"{filled} views without a mask got one"
+        f"{amount(filled, 'view')} without a mask got one"
     )
 
 

@@ -63,7 +63,7 @@ def _dispatched(name: str) -> Any:
 
 
 class DeviceDispatchRasterizer(Rasterizer, OptionalProducts):
-    """Hand every call of ``Rasterizer`` and ``OptionalProducts`` to one of two backends, by the surfels' device.
+    """Hand every call of ``Rasterizer`` and ``OptionalProducts`` to one of two backends, by the Gaussians' device.
 
     cpu, gpu: the two backends, both of which can run.
     """

@@ -1,7 +1,7 @@
 """The CUDA rasterizer: it checks and allocates here, and computes in ``beags_plugin._native.cuda``.
 
 All memory is torch's, all kernels run on torch's current stream. Only the GPU knows the number of pairs (a tile and a
-surfel that reaches it), so their memory is guessed from earlier renders, and all kernels of a render are launched on
+Gaussian that reaches it), so their memory is guessed from earlier renders, and all kernels of a render are launched on
 that guess. Then the host waits for the number, which the GPU has long before the image, and launches the last kernels
 again in the rare case that the guess was too small. The GPU never waits for the host.
 """
@@ -40,9 +40,9 @@ _TILE = 16
 
 @dataclass
 class _Frame:
-    """Surfels projected and sorted into tiles.
+    """Gaussians projected and sorted into tiles.
 
-    native: the compiled module's frame, which points into ``owned`` (per surfel) and ``pairs`` (per pair).
+    native: the compiled module's frame, which points into ``owned`` (per Gaussian) and ``pairs`` (per pair).
     saved: images that the forward saves for the backward.
     """
 
@@ -212,7 +212,7 @@ class CudaRasterizer(KernelRasterizer, OptionalProducts):
         with cuda_extension.on_device(device):
             frame, totals = self._project(module, inputs, camera, settings)
             counts, place = self._counts, self._counts.place(device)
-            wait = start_copy(totals)  # The numbers of pairs and of surfels that are not finite.
+            wait = start_copy(totals)  # The numbers of pairs and of Gaussians that are not finite.
             guess = counts.guess(place)
             if guess is None:
                 first, _ = wait()

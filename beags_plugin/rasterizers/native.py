@@ -30,8 +30,8 @@ from beags_plugin.system.errors import UserError
 class WorkCounts:
     """Work of one forward, which unlike its time has no noise.
 
-    lanes: pixel lanes that the kernels evaluate. contributing: (pixel, surfel) pairs among them that contribute.
-    tile_pairs: (tile, surfel) pairs of the kernels' bounds. box_pairs: those of the usual bounds, boxes of 3.33
+    lanes: pixel lanes that the kernels evaluate. contributing: (pixel, Gaussian) pairs among them that contribute.
+    tile_pairs: (tile, Gaussian) pairs of the kernels' bounds. box_pairs: those of the usual bounds, boxes of 3.33
         standard deviations.
     """
 
@@ -89,7 +89,7 @@ class NativeRasterizer(KernelRasterizer, OptionalProducts):
         floats = [getattr(call.inputs, name) for name in FLOATS]
         shift = call.inputs.means[:, :2]
         likes = zip((*floats, shift, call.background), needed, strict=True)
-        # new_empty suffices: the kernel writes zeros for the surfels that no pixel shows.
+        # new_empty suffices: the kernel writes zeros for the Gaussians that no pixel shows.
         results = InputGradients(*[value.new_empty(value.shape) if wanted else None for value, wanted in likes])
         state.backward(*floats, call.target, *gradients, *results, extension.threads())
         return results

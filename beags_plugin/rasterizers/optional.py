@@ -27,7 +27,7 @@ class OptionalProducts(ABC):
         """Return the non-zero numbers of pixels u with labels(u) = c and w_i(u) > min_weight.
 
         Returns keys [M] int64 as in ``Rasterizer.sparse_class_contributions``, and counts [M] int32, without gradient.
-        A hidden surfel counts too unless compositing stops before it.
+        A hidden Gaussian counts too unless compositing stops before it.
         """
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Numbers of pairs (a tile and a surfel that reaches it) in renders on GPUs.
+"""Numbers of pairs (a tile and a Gaussian that reaches it) in renders on GPUs.
 
 The GPU counts them. The host guesses the number from earlier renders, to allocate memory before it arrives.
 """

@@ -1,4 +1,4 @@
-"""Surfels in front of a camera and their hits with pixel rays, equation by equation (method, section 1)."""
+"""Gaussians in front of a camera and their hits with pixel rays, equation by equation (method, section 1)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from beags_plugin.rasterizers.interface import LARGEST, MAX_ALPHA, MIN_ALPHA, Ra
 
 @dataclass(frozen=True)
 class ProjectedSurfels:
-    """K surfels that survived culling, nearest first.
+    """K Gaussians that survived culling, nearest first.
 
     index: [K] int64, their indices among the inputs.
     A, B, C: [K, 3] the ray-splat cross product is q = dx A + dy B + C, with (dx, dy) the pixel minus ``shifted``.
@@ -56,7 +56,7 @@ def finite_surfels(inputs: SurfelInputs) -> Tensor:
 
 
 def project(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> ProjectedSurfels:
-    """Cull, project and sort N surfels; differentiable."""
+    """Cull, project and sort N Gaussians; differentiable."""
     with torch.no_grad():
         depth = inputs.means @ camera.rotation[2] + camera.translation[2]
         finite = finite_surfels(inputs) & (depth <= LARGEST)
@@ -66,7 +66,7 @@ def project(inputs: SurfelInputs, camera: Camera, settings: RasterSettings) -> P
     projected = _project(inputs, index, camera)
     sound = _is_finite(projected)
     if not bool(sound.all()):
-        # Surfels that overflow are left out and the rest projected again: even an unused infinity would give NaN in the
+        # Gaussians that overflow are left out, the rest projected again: even an unused infinity would give NaN in the
         # backward.
         projected = _project(inputs, index[sound], camera)
     return replace(projected, num_nonfinite=int((~finite).sum()) + int((~sound).sum()))
@@ -79,7 +79,7 @@ def _is_finite(projected: ProjectedSurfels) -> Tensor:
 
 
 def _project(inputs: SurfelInputs, index: Tensor, camera: Camera) -> ProjectedSurfels:
-    """Project the surfels ``index``; differentiable."""
+    """Project the Gaussians ``index``; differentiable."""
     p = inputs.means[index] @ camera.rotation.T + camera.translation
     opacity = torch.sigmoid(inputs.opacity_logits[index])
     axes = camera.rotation @ rotation_from_quat(inputs.quats[index])
@@ -131,13 +131,13 @@ def _screen_box(M: Tensor, center: Tensor, opacity: Tensor, camera: Camera) -> T
 
 
 def on_screen(projected: ProjectedSurfels, x0: float, y0: float, x1: float, y1: float) -> Tensor:
-    """Return [K] bool: the surfel's box touches the rectangle (pixels)."""
+    """Return [K] bool: the Gaussian's box touches the rectangle (pixels)."""
     low, high = projected.box[:, :2], projected.box[:, 2:]
     return (low[:, 0] < x1) & (high[:, 0] > x0) & (low[:, 1] < y1) & (high[:, 1] > y0)
 
 
 def hits(projected: ProjectedSurfels, chosen: Tensor, pixels: Tensor, near: float, smooth_cutoff: bool) -> Hits:
-    """Return alpha and depth of the chosen surfels [S] at pixel centres [P, 2].
+    """Return alpha and depth of the chosen Gaussians [S] at pixel centres [P, 2].
 
     smooth_cutoff: fade alpha out above 1/255 instead of cutting it there, so that finite differences hold (tests).
     """

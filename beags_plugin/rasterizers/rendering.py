@@ -75,7 +75,7 @@ def draw_features(
     """Render any number of channels, [H, W, F] sum_i w_i f_i: no background, not divided by A.
 
     features: [N, F] of the inputs' dtype, F at least 1. Differentiable in them and in the inputs except the colours.
-    A surfel with a colour or feature that is not finite contributes to no channel. Backends without
+    A Gaussian with a colour or feature that is not finite contributes to no channel. Backends without
     ``feature_channels`` render three channels at a time.
     """
     channels, n = features.shape[-1], len(inputs.means)

@@ -25,13 +25,13 @@ from beags_plugin.rasterizers.optional import OptionalProducts
 from beags_plugin.rasterizers.reference_geometry import ProjectedSurfels, hits, on_screen, project
 from beags_plugin.rasterizers.rendering import class_channels_by_threes
 
-KEPT_PER_PAIR = 40  # numbers that autograd keeps per pixel and surfel; measured
-BLOCK = 16  # pixels are rendered in squares of this side, each with the surfels that reach it
+KEPT_PER_PAIR = 40  # numbers that autograd keeps per pixel and Gaussian; measured
+BLOCK = 16  # pixels are rendered in squares of this side, each with the Gaussians that reach it
 
 
 @dataclass(frozen=True)
 class _Block:
-    """P pixels of a square, and S surfels that reach it, nearest first.
+    """P pixels of a square, and S Gaussians that reach it, nearest first.
 
     rows, columns: slices of the image. index: [S] int64 indices of the inputs; chosen: [S] of the projected surfels.
     weights: [P, S] w_i. depth: [P, S]. remaining: [P] T_end. before, after: [P, S] transmittance around each surfel.
@@ -143,7 +143,7 @@ class TorchRasterizer(Rasterizer, OptionalProducts):
         num_classes: int,
         counted: Callable[[Tensor], Tensor],
     ) -> Tensor:
-        """Sum ``counted`` of the weights [P, S] by surfel and label, [N, num_classes]."""
+        """Sum ``counted`` of the weights [P, S] by Gaussian and label, [N, num_classes]."""
         total = inputs.means.new_zeros(inputs.means.shape[0], num_classes)
         for block in self._blocks(inputs, camera, settings):
             here = labels[block.rows, block.columns].reshape(-1).long()
@@ -226,7 +226,7 @@ class TorchRasterizer(Rasterizer, OptionalProducts):
         hit = hits(projected, chosen, pixels, settings.near, self.smooth_cutoff)
         after = torch.cumprod(1.0 - hit.alpha, dim=-1)
         before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=-1)[:, : after.shape[1]]
-        # ``after`` never grows: the surfel that would take it below the bound and all behind it do not count.
+        # ``after`` never grows: the Gaussian that would take it below the bound and all behind it do not count.
         counted = after.detach() >= MIN_TRANSMITTANCE
         weights = torch.where(counted, hit.alpha * before, torch.zeros_like(before))
         remaining = torch.where(counted, 1.0 - hit.alpha, torch.ones_like(before)).prod(dim=-1)
@@ -242,7 +242,7 @@ def _squares(camera: Camera) -> Iterator[tuple[slice, slice]]:
 
 
 def _autograd_bytes(projected: ProjectedSurfels, camera: Camera) -> float:
-    """Estimate the memory that autograd keeps of a render, from the blocks that each surfel's box meets."""
+    """Estimate the memory that autograd keeps of a render, from the blocks that each Gaussian's box meets."""
     low, high = projected.box.clamp_min(0.0).unflatten(1, (2, 2)).unbind(1)
     high = torch.minimum(high, high.new_tensor([camera.width, camera.height]))
     sides = ((high / BLOCK).ceil() - (low / BLOCK).floor()).clamp_min(0.0) * BLOCK

@@ -106,7 +106,7 @@ def _frame_name(frame: StartFrame, scene: ImportedScene) -> str:
 
 
 def _placed(path: Path, scene: ImportedScene, usable: Tensor, surfels: Surfels) -> tuple[Surfels, Tensor | None]:
-    """Return the surfels of the ``usable`` [N] Gaussians, and the origin of their file, [3] float64, or None for 0.
+    """Return the ``usable`` [N] Gaussians, flat, and the origin of their file, [3] float64, or None for 0.
 
     They are in float64 if the file has positions in double precision, as for a world far from 0.
     """
