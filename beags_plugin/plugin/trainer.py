@@ -28,7 +28,7 @@ from beags_plugin.plugin.training.resumable import GlobalRandom, Resumable
 from beags_plugin.plugin.training.scene_model import SceneModel
 from beags_plugin.plugin.training.timing import Estimate, StageSeconds
 from beags_plugin.plugin.training.warm_start import start_from_scene
-from beags_plugin.plugin.viewer.serving import end_rendering
+from beags_plugin.plugin.viewer.serving import end_threads
 from beags_plugin.plugin.views.datamanager import BeagsDataManager
 from beags_plugin.runs.layout import REPORT_FILE
 from beags_plugin.system.errors import UserError, is_of_disk, refused, silence_libraries
@@ -176,7 +176,7 @@ class BeagsTrainer(Trainer):
             self._stop(error)
             raise
         finally:
-            end_rendering(self.viewer_state)
+            end_threads(self.viewer_state)
         self._release()
 
     def _train(self) -> None:

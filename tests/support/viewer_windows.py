@@ -57,7 +57,7 @@ class Window:
     def __init__(self, config_path, trainer=None, change=lambda model: None) -> None:
         config, pipeline, _, _ = eval_setup(config_path, test_mode="test")
         change(pipeline.model)
-        pipeline.model.viewer_panel._follow = lambda: None  # the tests call follow() when they want it
+        pipeline.model.viewer_panel._begin_to_follow = lambda viewer: None  # the tests call follow() when they want it
         config.viewer.websocket_port = None
         self.lock = threading.Lock()
         log = config.get_base_dir() / "viewer.log"

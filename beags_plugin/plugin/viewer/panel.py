@@ -28,11 +28,11 @@ from beags_plugin.plugin.viewer.pick_tab import PickTab
 from beags_plugin.plugin.viewer.pick_work import take_picked
 from beags_plugin.plugin.viewer.picking import under_cursor
 from beags_plugin.plugin.viewer.serving import (
+    Follower,
     end_when_interrupted,
     first_folder,
     hide_training_cameras,
     offer_whole_pictures,
-    repeat,
     set_pace,
     show_text,
 )
@@ -141,7 +141,7 @@ class ObjectPanel(ViewerElement[None]):
         viewer.viser_server.on_client_connect(self._joined)
         if viewer.trainer is None:
             end_when_interrupted(viewer.viser_server)
-        threading.Thread(target=self._follow, name="beags panel", daemon=True).start()
+        self._begin_to_follow(viewer)
 
     def listen(self, listening: bool) -> None:
         """Start or stop waiting for the click that picks; only one, because the page's camera is fixed meanwhile."""
@@ -233,8 +233,8 @@ class ObjectPanel(ViewerElement[None]):
 
     # -- following the scene -------------------------------------------------------------------------------------------
 
-    def _follow(self) -> None:
-        repeat(self.follow, REFRESH_SECONDS, lambda text: self.note("panel", text))
+    def _begin_to_follow(self, viewer: Viewer) -> None:
+        Follower(viewer, self.follow, REFRESH_SECONDS, lambda text: self.note("panel", text)).start()
 
     def follow(self) -> None:
         """Update the panel."""

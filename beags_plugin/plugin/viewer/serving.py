@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
@@ -112,25 +113,34 @@ def offer_whole_pictures(controls: Any) -> None:
     controls.update_output_options = lambda names: offer([name for name in names if name != "gl_z_buf_depth"])
 
 
-def repeat(step: Callable[[], None], seconds: float, failed: Callable[[str], None]) -> None:
-    """Do a step every ``seconds``, for ever. failed: receives a message about each exception."""
-    pause = threading.Event()
-    while not pause.wait(seconds):
-        try:
-            step()
-        except Exception as error:
-            failed(f"{type(error).__name__}: {error}")
+class Follower(threading.Thread):
+    """Does a step every ``seconds`` while ``running``. viewer: nerfstudio's. failed: receives exceptions, as text."""
+
+    def __init__(self, viewer: Viewer, step: Callable[[], None], seconds: float, failed: Callable[[str], None]) -> None:
+        super().__init__(name="beags panel", daemon=True)
+        self.viewer = viewer
+        self.running = True
+        self._step, self._seconds, self._failed = step, seconds, failed
+
+    def run(self) -> None:
+        """Do the steps."""
+        while self.running:
+            time.sleep(self._seconds)
+            try:
+                self._step()
+            except Exception as error:
+                self._failed(f"{type(error).__name__}: {error}")
 
 
-def end_rendering(viewer: object) -> None:
-    """End the render threads of every page of a viewer, waiting at most 30 s for each to finish its picture.
+def end_threads(viewer: object) -> None:
+    """End the render threads of every page of a viewer and what follows them, waiting at most 30 s for each to finish.
 
-    viewer: nerfstudio's, or None. A render thread inside the rasterizer would abort an interpreter that ends.
+    viewer: nerfstudio's, or None. A thread inside the rasterizer or torch would abort an interpreter that ends.
     """
     threads = [
         thread
         for thread in threading.enumerate()  # It knows threads of closed pages too.
-        if isinstance(thread, RenderStateMachine) and thread.viewer is viewer
+        if isinstance(thread, (RenderStateMachine, Follower)) and thread.viewer is viewer
     ]
     for thread in threads:
         thread.running = False

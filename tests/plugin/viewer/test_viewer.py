@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,6 +21,7 @@ from written_splats import read_ply
 from beags_plugin.core.membership import Membership
 from beags_plugin.labels.colors import colorize
 from beags_plugin.plugin.viewer.choice import Choice
+from beags_plugin.plugin.viewer.serving import Follower, end_threads
 from beags_plugin.plugin.viewer.viewed_run import ViewedRun
 from beags_plugin.plugin.viewer.viewing import CHANNELS
 
@@ -285,3 +287,16 @@ def test_panel_and_legend_do_not_wait_for_a_step_but_the_click_does(window, monk
     window.panel.follow()
     window.panel.clicked(ViewerClick((3.0, 0.0, 0.3), (-1.0, 0.0, -0.1), (0.5, 0.5)))
     assert "busy" in window.panel.notes["object"]
+
+
+def test_what_follows_a_training_ends_before_the_process(window):
+    """A thread inside torch aborts a Python that ends."""
+    steps = []
+    follower = Follower(window.viewer, lambda: steps.append(1), 0.01, steps.append)
+    follower.start()
+    while not steps:
+        time.sleep(0.01)
+    end_threads(None)
+    assert follower.is_alive()
+    end_threads(window.viewer)
+    assert not follower.is_alive() and set(steps) == {1}
