@@ -43,7 +43,7 @@ class ShownFiles:
             self._report("The former export is still being written.")
             return
         self._report("Exporting ...")
-        threading.Thread(target=self._write_and_report, name="beags export", daemon=True).start()
+        threading.Thread(target=self._write_and_report, name="beags export").start()  # a training waits for it
 
     def _write_and_report(self) -> None:
         try:
