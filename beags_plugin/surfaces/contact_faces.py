@@ -39,7 +39,7 @@ class Witnesses:
     """Numbers of views that face the front of each of M places, by what they show there; all [M] int64.
 
     hidden: another object before the place. open: the background before it, or anything behind it, by more than ``TAU``
-    of the depth. Views that show the place's own object there, and pixels without a label, do not count.
+    of the depth; or its own object there. Views with that before it, and pixels without a label, do not count.
     """
 
     def __init__(self, places: Surfels, class_ids: Tensor) -> None:
@@ -56,9 +56,10 @@ class Witnesses:
         faces = ((to_camera * self._normals).sum(dim=1) > _FACING) & inside
         label, surface = labels[row, column], depth[row, column].double()
         surface = torch.where(surface > 0, surface, torch.inf)
-        other = (label != self._class_ids) & (label != IGNORE)
+        own, other = label == self._class_ids, (label != self._class_ids) & (label != IGNORE)
         is_object = other & (label != BACKGROUND)
         self.hidden += faces & is_object & (surface < z)  # Objects touch: any distance counts.
+        self.open += faces & own & ~hides(surface, z)
         self.open += faces & other & ((surface >= (1.0 + TAU) * z) | (~is_object & hides(surface, z)))
 
     def in_contact(self) -> Tensor:

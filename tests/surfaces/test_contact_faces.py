@@ -150,6 +150,7 @@ def test_views_without_labels_say_nothing(monkeypatch):
         (0, 2.0, 0, 0),  # It lies at the place: undecided.
         (0, 0.0, 0, 1),  # Nothing is there at all.
         (BOX, 1.9, 0, 0),  # Its own object hides it.
+        (BOX, 2.0, 0, 1),  # Its own object has a surface there.
         (IGNORE, 1.9, 0, 0),
     ],
 )
