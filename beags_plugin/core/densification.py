@@ -132,7 +132,7 @@ def densify(
     surfels: Surfels, mean_gradient: Tensor, units: Tensor, config: DensifyConfig, step: int,
     generator: torch.Generator, apart: tuple[Tensor, int] | None = None,
 ) -> Densified:  # fmt: skip
-    """Clone, split and prune surfels.
+    """Clone, split and prune Gaussians.
 
     surfels: N Gaussians without gradients. mean_gradient: [N]. units: [N] of ``length_units``. step: the current step,
     for ``prune_scale_after``. apart: [N] bool, Gaussians with a bound of their own, and that bound (0: none); the

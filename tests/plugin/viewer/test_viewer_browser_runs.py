@@ -51,8 +51,8 @@ def test_a_training_is_watched_and_goes_on_to_its_end(tmp_path):
         page.choose("Output type", "depth")
         awaited(page, lambda now: differing(now, whole) > 0.002 and varied(now) > 2)
         page.wait(lambda: 0 <= step_of(page) < STEPS[0])
-        page.press("Export what is shown")
-        page.wait_for_text("Exported to")  # before the first checkpoint
+        page.press("Export what is shown")  # The run has no checkpoint yet.
+        page.wait_for_text("Exported to")
         assert process.poll() is None
         (seen / "base").touch()
         page.wait(lambda: step_of(page) > STEPS[0], 300)
