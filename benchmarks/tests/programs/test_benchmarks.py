@@ -53,7 +53,9 @@ def test_a_program_finds_what_it_imports_from_us(path):
                 assert hasattr(module, alias.name) or importlib.import_module(f"{node.module}.{alias.name}"), alias.name
 
 
-@pytest.mark.parametrize("name", ["kernels.rasterizer", "kernels.cuda", "studies.answers", "studies.page_tables"])
+@pytest.mark.parametrize(
+    "name", ["kernels.rasterizer", "kernels.accuracy", "kernels.cuda", "studies.answers", "studies.page_tables"]
+)
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # Python warns of modules that are imported already.
 def test_a_program_says_what_it_takes(name, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [name, "--help"])
