@@ -108,11 +108,11 @@ def scale_axis(set_scale: Callable[[str], None], values: Sequence[float | None])
         set_scale("log")
 
 
-def save_figure(path: Path, figure: Figure) -> None:
-    """Write the picture in the format of its suffix, and make its folder."""
+def save_figure(path: Path, figure: Figure, description: str | None = None) -> None:
+    """Write the picture in the format of its suffix, and make its folder. description: kept in a PNG."""
     from matplotlib import pyplot
 
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110)
+        figure.savefig(path, dpi=110, metadata=None if description is None else {"Description": description})
     pyplot.close(figure)

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from PIL import Image
 from places import ROOT
 
 pytest.importorskip("nerfstudio")
@@ -36,6 +37,12 @@ def test_the_curve_follows_the_figures(clone):
     row["extracted_biou_after"] = 0.1
     path.write_text(json.dumps(content))
     assert not np.array_equal(first, image.imread(cost_curve.draw(clone)))
+
+
+def test_the_committed_curve_has_the_committed_figures(clone):
+    """The picture keeps a digest of its points: it cannot fall behind README's table."""
+    with Image.open(ROOT / "docs/images/cost.png") as committed, Image.open(cost_curve.draw(clone)) as drawn:
+        assert committed.info["Description"] == drawn.info["Description"] == cost_curve.digest()
 
 
 def test_a_row_that_lacks_is_named(clone):
