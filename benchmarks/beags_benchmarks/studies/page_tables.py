@@ -195,6 +195,13 @@ TABLES: tuple[PageTable, ...] = (
         _of_scene("captures-length", DIGGER, _ALL),
         _LONG,
     ),
+    PageTable(
+        "docs/results.md",
+        "room-1024",
+        "generated room, 1,024 x 768",
+        _of_scene("room-1024", "room1024", _ALL),
+        _LONG,
+    ),
     *(
         PageTable(
             "notes/refinement-on-captures.md",
